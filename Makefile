@@ -1,0 +1,37 @@
+# Works on a fresh machine with Python >= 3.11 and make. Choose the interpreter with e.g. `make train PYTHON=python3.12`.
+PYTHON ?= python3
+PIP = .venv/bin/python -m pip install -q --disable-pip-version-check
+
+.PHONY: train test test-slow lint clean
+
+train: .venv/.installed  ## one demonstration, one seed, a few minutes
+	.venv/bin/hindrl train --env FixedGridPickAndPlace --algo hindrl --demos 1 --seeds 1 --out runs/quickstart --overwrite
+
+test: .venv/.installed-test
+	.venv/bin/python -m pytest
+
+test-slow: .venv/.installed-test  ## the learning tests, which take minutes each
+	.venv/bin/python -m pytest -m slow
+
+lint: .venv/.installed-test
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+
+clean:  ## everything that can be made again; results in runs/ stay
+	rm -rf .venv build dist .pytest_cache .hypothesis .ruff_cache *.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# The stamp files say which lock was installed last, so that a second call installs nothing.
+.venv/.installed: requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
+	  { echo "hindrl_jax needs Python >= 3.11, which '$(PYTHON)' is not; name one that is, e.g. make train PYTHON=python3.12" >&2; exit 1; }
+	@echo "installing into .venv (about a minute) ..."
+	@$(PYTHON) -m venv .venv
+	@$(PIP) -r requirements.lock
+	@$(PIP) --no-deps --no-build-isolation -e .
+	@touch $@
+
+.venv/.installed-test: requirements-test.lock .venv/.installed
+	@echo "installing the tests' packages into .venv ..."
+	@$(PIP) -r requirements-test.lock
+	@touch $@

@@ -1,0 +1,44 @@
+"""hindrl_jax: learning sparse-reward tasks from a handful of demonstrations, in pure functional JAX.
+
+    import hindrl_jax as hindrl
+
+    env = hindrl.make("FixedGridPickAndPlace")
+    demonstrations = hindrl.record_demonstrations(env, num_demos=1).episodes
+    result = hindrl.train(env, demonstrations, hindrl.preset("hindrl"), seeds=[0])
+    print(result.final_success)
+
+The algorithm is in `goals`, `relabel`, `replay`, `networks`, `losses`, `agent`, `rollout` and `train`: pure functions that know no task by name.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+__version__ = "0.1.0"
+
+# Loaded on first use: `envs` and `experts` import the core below this package, and the names here import `envs` and `experts`.
+_EXPORTS = {
+    "Result": "hindrl_jax.experiment",
+    "UserError": "hindrl_jax.errors",
+    "load_demonstrations": "hindrl_jax.datasets",
+    "load_run": "hindrl_jax.runs",
+    "make": "hindrl_jax.registry",
+    "preset": "hindrl_jax.presets",
+    "record_demonstrations": "hindrl_jax.experiment",
+    "save_demonstrations": "hindrl_jax.datasets",
+    "save_run": "hindrl_jax.runs",
+    "train": "hindrl_jax.experiment",
+}
+
+__all__ = ["__version__", *_EXPORTS]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _EXPORTS:
+        return getattr(importlib.import_module(_EXPORTS[name]), name)
+    raise AttributeError(f"module 'hindrl_jax' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(set(globals()) | set(__all__))

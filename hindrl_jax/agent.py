@@ -1,0 +1,174 @@
+"""The agent: truncated quantile critics, a tanh-Gaussian actor with a behaviour cloning loss, an automatic entropy coefficient.
+
+One `update` serves TQCfD, HinDRL and Smooth HinDRL, which differ only in the batch they are given; `update_bc` is the BC baseline, on the
+same actor. Differences from the TQC paper (Kuznetsov et al., 2020): the loss is averaged, not summed, over quantiles (as in sb3-contrib,
+which the thesis used), and the discount comes with each transition, so that n-step returns and termination need no special case.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from hindrl_jax.config import AgentConfig
+from hindrl_jax.losses import behaviour_cloning, entropy_coefficient, quantile_huber, target_atoms
+from hindrl_jax.networks import ActionDistribution, Params, apply_actor, apply_critics, init_actor, init_critics
+from hindrl_jax.types import Array, Transition
+
+Metrics = dict[str, Array]
+
+
+@struct.dataclass(kw_only=True)
+class AgentState:
+    """Everything the agent learns."""
+
+    actor: Params
+    critics: Params  # leaves (N, ...)
+    target_critics: Params  # leaves (N, ...)
+    log_alpha: Array  # ()
+    actor_optimiser: optax.OptState
+    critic_optimiser: optax.OptState
+    alpha_optimiser: optax.OptState
+
+
+def _optimiser(config: AgentConfig) -> optax.GradientTransformation:
+    return optax.adam(config.learning_rate)
+
+
+def policy_input(observation: Array, achieved_goal: Array, desired_goal: Array, config: AgentConfig) -> Array:
+    """Joins what the networks see, along the last axis: (B, D), (B, G), (B, G) -> (B, input_dim)."""
+    if config.policy_input == "observation_goal":
+        return jnp.concatenate([observation, desired_goal], axis=-1)
+    return jnp.concatenate([achieved_goal, desired_goal, observation], axis=-1)
+
+
+def init(key: Array, config: AgentConfig, *, observation_dim: int, goal_dim: int, action_dim: int) -> AgentState:
+    """A fresh agent; the target critics start as a copy of the critics."""
+    key_actor, key_critics = jax.random.split(key)
+    sizes = (jnp.zeros((1, observation_dim)), jnp.zeros((1, goal_dim)), jnp.zeros((1, goal_dim)))
+    input_dim = policy_input(*sizes, config).shape[-1]
+    actor = init_actor(key_actor, config, input_dim=input_dim, action_dim=action_dim)
+    critics = init_critics(key_critics, config, input_dim=input_dim, action_dim=action_dim)
+    log_alpha = jnp.log(jnp.asarray(config.initial_alpha, jnp.float32))
+    optimiser = _optimiser(config)
+    return AgentState(
+        actor=actor,
+        critics=critics,
+        target_critics=jax.tree.map(jnp.copy, critics),
+        log_alpha=log_alpha,
+        actor_optimiser=optimiser.init(actor),
+        critic_optimiser=optimiser.init(critics),
+        alpha_optimiser=optimiser.init(log_alpha),
+    )
+
+
+def policy(actor: Params, inputs: Array, config: AgentConfig, *, action_dim: int) -> ActionDistribution:
+    """The distribution over actions at inputs (B, input_dim), see `policy_input`."""
+    return apply_actor(actor, inputs, config, action_dim=action_dim)
+
+
+def _descend(gradient: Any, optimiser_state: optax.OptState, params: Any, config: AgentConfig) -> tuple[Any, optax.OptState]:
+    updates, optimiser_state = _optimiser(config).update(gradient, optimiser_state, params)
+    return optax.apply_updates(params, updates), optimiser_state
+
+
+def update(key: Array, state: AgentState, batch: Transition, *, inputs: Array, next_inputs: Array, config: AgentConfig) -> tuple[AgentState, Metrics]:
+    """One gradient step of entropy coefficient, critics and actor, then of the target critics.
+
+    Critic: quantile Huber loss towards the truncated atoms of r + discount (Z' - alpha log pi(a' | s')).
+    Actor: mean(alpha log pi - mean over critics and quantiles of Z(s, a_pi)) + bc_weight * behaviour cloning loss.
+
+    Args:
+      key: random key.
+      state: the agent.
+      batch: B transitions.
+      inputs, next_inputs: (B, input_dim) network inputs at the two ends of the transitions, see `policy_input`.
+      config: static.
+
+    Returns:
+      The new agent and scalar metrics.
+    """
+    key_actor, key_next = jax.random.split(key)
+    action_dim = batch.action.shape[-1]
+    target_entropy = -float(action_dim) if config.target_entropy is None else config.target_entropy
+    alpha = jnp.exp(state.log_alpha)
+
+    next_action, next_log_prob = policy(state.actor, next_inputs, config, action_dim=action_dim).sample(key_next)
+    next_atoms = apply_critics(state.target_critics, next_inputs, next_action, config)
+    targets = target_atoms(
+        next_atoms.reshape(-1, next_atoms.shape[-1]),
+        reward=batch.reward,
+        discount=batch.discount,
+        entropy_bonus=-alpha * next_log_prob,
+        num_dropped=config.num_critics * config.top_quantiles_to_drop_per_net,
+    )
+
+    def critic_loss(critics: Params) -> tuple[Array, Array]:
+        quantiles = apply_critics(critics, inputs, batch.action, config)
+        return jnp.mean(quantile_huber(quantiles, targets)), jnp.mean(quantiles)
+
+    (loss_critic, value), gradient = jax.value_and_grad(critic_loss, has_aux=True)(state.critics)
+    critics, critic_optimiser = _descend(gradient, state.critic_optimiser, state.critics, config)
+
+    def actor_loss(actor: Params) -> tuple[Array, tuple[Array, Array, Array]]:
+        distribution = policy(actor, inputs, config, action_dim=action_dim)
+        action, log_prob = distribution.sample(key_actor)
+        value = jnp.mean(apply_critics(critics, inputs, action, config), axis=(0, 1))
+        cloned = distribution.mode if config.bc_action == "mean" else action
+        bc = behaviour_cloning(cloned, batch.action, batch.is_demonstration, form=config.bc_loss)
+        return jnp.mean(alpha * log_prob - value) + config.bc_weight * bc, (log_prob, bc, jnp.mean(value))
+
+    (loss_actor, (log_prob, bc, policy_value)), gradient = jax.value_and_grad(actor_loss, has_aux=True)(state.actor)
+    actor, actor_optimiser = _descend(gradient, state.actor_optimiser, state.actor, config)
+
+    loss_alpha, gradient = jax.value_and_grad(entropy_coefficient)(state.log_alpha, log_prob, target_entropy=target_entropy)
+    log_alpha, alpha_optimiser = _descend(gradient, state.alpha_optimiser, state.log_alpha, config)
+
+    new_state = AgentState(
+        actor=actor,
+        critics=critics,
+        target_critics=optax.incremental_update(critics, state.target_critics, config.target_update_rate),
+        log_alpha=log_alpha,
+        actor_optimiser=actor_optimiser,
+        critic_optimiser=critic_optimiser,
+        alpha_optimiser=alpha_optimiser,
+    )
+    metrics = {
+        "critic/loss": loss_critic,
+        "critic/value": value,
+        "critic/target": jnp.mean(targets),
+        "actor/loss": loss_actor,
+        "actor/bc_loss": bc,
+        "actor/value": policy_value,
+        "actor/entropy": -jnp.mean(log_prob),
+        "alpha/loss": loss_alpha,
+        "alpha/value": alpha,
+        "batch/reward": jnp.sum(batch.reward),
+    }
+    return new_state, metrics
+
+
+def update_bc(state: AgentState, batch: Transition, *, inputs: Array, config: AgentConfig) -> tuple[AgentState, Metrics]:
+    """One gradient step of behaviour cloning alone: mean squared error of tanh(mean) to the demonstrated action (thesis eq. 4.1).
+
+    Args:
+      state: the agent; only the actor and its optimiser change.
+      batch: B demonstration transitions.
+      inputs: (B, input_dim) network inputs.
+      config: static.
+
+    Returns:
+      The new agent and scalar metrics.
+    """
+
+    def loss(actor: Params) -> Array:
+        action = policy(actor, inputs, config, action_dim=batch.action.shape[-1]).mode
+        return jnp.mean(jnp.square(action - batch.action))
+
+    value, gradient = jax.value_and_grad(loss)(state.actor)
+    actor, actor_optimiser = _descend(gradient, state.actor_optimiser, state.actor, config)
+    return state.replace(actor=actor, actor_optimiser=actor_optimiser), {"actor/bc_loss": value}

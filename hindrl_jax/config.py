@@ -1,0 +1,217 @@
+"""Every knob of training, as frozen dataclasses: hashable, passed whole, static under `jax.jit`.
+
+The line under each field is its documentation and its help text on the command line. The defaults are the project's own recipe; the thesis's
+numbers and the original code's quirks are presets (`hindrl_jax.presets`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from types import UnionType
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+Algorithm = Literal["bc", "tqcfd", "hindrl", "smooth-hindrl"]
+Strategy = Literal["final", "future", "rollout_conditioned", "episode", "task_conditioned", "joint_union"]
+"""Hindsight strategies, explained in `hindrl_jax.relabel`."""
+
+
+def _check_types(config: object) -> None:
+    """Raises ValueError naming the first field whose value is not of the type that its annotation asks for."""
+    for name, hint in get_type_hints(type(config)).items():
+        if not _matches(getattr(config, name), hint):
+            raise ValueError(f"{name} = {getattr(config, name)!r} is not usable: it must be {_in_words(hint)}")
+
+
+def _check(config: object, **conditions: tuple[bool, str]) -> None:
+    """Raises ValueError naming the first field whose condition does not hold, its value and what is asked of it."""
+    for name, (holds, requirement) in conditions.items():
+        if not holds:
+            raise ValueError(f"{name} = {getattr(config, name)!r} is not usable: it must be {requirement}")
+
+
+def _matches(value: object, hint: Any) -> bool:
+    """Whether a value is of the (simple) type that a field asks for; an int serves as a float, a bool as neither, NaN and infinity as nothing."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return value in arguments
+    if origin is UnionType:
+        return any(_matches(value, argument) for argument in arguments)
+    if origin is tuple:
+        return isinstance(value, tuple) and all(_matches(item, arguments[0]) for item in value)
+    if hint is float:
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, hint) and (hint is bool or not isinstance(value, bool))
+
+
+def _in_words(hint: Any) -> str:
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return f"one of {', '.join(map(str, arguments))}"
+    if origin is UnionType:
+        return " or ".join(_in_words(argument) for argument in arguments)
+    if origin is tuple:
+        return "a list of whole numbers"
+    return {int: "a whole number", float: "a finite number", bool: "true or false", type(None): "none"}.get(hint, f"a {hint.__name__}")
+
+
+@dataclasses.dataclass(frozen=True)
+class BatchConfig:
+    """How a training batch is put together (thesis section 4.1.2)."""
+
+    batch_size: int = 512
+    """Rows of the batch of a gradient step, demonstrations included."""
+    max_demo_ratio: float = 0.25
+    """Share of demonstration rows in the batch at the start of training (MAX_d of thesis eq. 4.9, as a ratio)."""
+    reach_zero: int | None = None
+    """Environment step at which the demonstration share has fallen linearly to zero (thesis eq. 4.9); None keeps it constant."""
+    num_sampled_goals: int = 4
+    """Relabelled rows per original replay row, n: the relabelled share of the replay rows is n / (n + 1). Zero turns relabelling off."""
+    hindrl_sampling_strategy: Strategy = "task_conditioned"
+    """Where relabelled goals come from; rollout_conditioned is the thesis's name for future."""
+    union_sampling_ratio: float = 0.5
+    """For joint_union: the share of relabelled goals that comes from the demonstrations."""
+    n_step: int = 5
+    """Steps of reward before the value estimate takes over."""
+    gamma: float = 0.98
+    """Discount factor."""
+    inclusive_goal_test: bool = True
+    """A goal counts as reached at distance <= epsilon; false gives the strict < of the thesis's formula and code."""
+    terminate_on_relabel: bool = True
+    """Reaching a relabelled goal ends the return; false bootstraps past it, as the thesis does, and values can exceed 1."""
+    timeouts_are_terminal: bool = False
+    """Treat episodes cut by the horizon as terminated, as the original code does by mistake."""
+
+    def __post_init__(self) -> None:
+        _check_types(self)
+        if self.hindrl_sampling_strategy == "rollout_conditioned":
+            object.__setattr__(self, "hindrl_sampling_strategy", "future")
+        _check(
+            self,
+            batch_size=(self.batch_size >= 1, "at least 1"),
+            max_demo_ratio=(0.0 <= self.max_demo_ratio <= 1.0, "between 0 and 1"),
+            reach_zero=(self.reach_zero is None or self.reach_zero >= 1, "at least 1 environment step, or None"),
+            num_sampled_goals=(self.num_sampled_goals >= 0, "0 (no relabelling) or more"),
+            union_sampling_ratio=(0.0 <= self.union_sampling_ratio <= 1.0, "between 0 and 1"),
+            n_step=(self.n_step >= 1, "at least 1"),
+            gamma=(0.0 < self.gamma <= 1.0, "in (0, 1]"),
+        )
+        if self.batch_size - self.max_demo_rows < 1:
+            raise ValueError(
+                f"max_demo_ratio = {self.max_demo_ratio} of batch_size = {self.batch_size} leaves no replay row: "
+                "lower max_demo_ratio or raise batch_size"
+            )
+
+    @property
+    def max_demo_rows(self) -> int:
+        """Number of demonstration rows at the start of training."""
+        return int(self.max_demo_ratio * self.batch_size)
+
+
+@dataclasses.dataclass(frozen=True)
+class GoalConfig:
+    """Epsilon, the goals taken from demonstrations, and the behavioural goals."""
+
+    m: int = 0
+    """Distance in steps between the demonstration states whose mean distance gives epsilon (thesis eq. 4.7); 0 gives epsilon 0."""
+    k: float = 0.0
+    """Weight of the standard deviation in epsilon (thesis eq. 4.7)."""
+    epsilon_filtering: bool = False
+    """Drop demonstration goals that lie within epsilon of the last kept one (thesis algorithm 6, Smooth HinDRL)."""
+    behavioural_goals: Literal["final_demonstration_states", "task"] = "final_demonstration_states"
+    """Goal of a rollout: the end of a random demonstration (thesis algorithm 5), or the task's one constant goal (original code)."""
+    exclude_last_goal: bool = False
+    """Never draw the last goal of a demonstration, as the original code does by mistake."""
+    rescale_demo_actions: bool = True
+    """Bring demonstrated actions to the policy's [-1, 1]; false leaves them in the environment's own range, as the original code does."""
+    misalign_demo_actions: bool = False
+    """Pair each demonstrated action with the observation after it, as the original code does for robot demonstrations."""
+
+    def __post_init__(self) -> None:
+        _check_types(self)
+        _check(self, m=(self.m >= 0, "0 or more"), k=(self.k >= 0.0, "0 or more"))
+
+
+@dataclasses.dataclass(frozen=True)
+class AgentConfig:
+    """Truncated quantile critics, the actor, and how both are trained."""
+
+    net_arch: tuple[int, ...] = (64, 64, 64, 64)
+    """Widths of the hidden layers, the same for actor and critics."""
+    layer_norm: bool = False
+    """Layer normalisation before each activation of the critics."""
+    learning_rate: float = 1e-3
+    """Adam's step size, for actor, critics and entropy coefficient."""
+    num_critics: int = 2
+    """Number of quantile critics."""
+    num_quantiles: int = 25
+    """Quantiles per critic."""
+    top_quantiles_to_drop_per_net: int = 2
+    """Largest target quantiles dropped per critic (TQC's truncation)."""
+    target_update_rate: float = 0.02
+    """Share of the online critics that moves into the target critics at each gradient step (Polyak averaging)."""
+    initial_alpha: float = 1.0
+    """Entropy coefficient at the start; it is tuned automatically from there."""
+    target_entropy: float | None = None
+    """Entropy that the automatic tuning aims at; None means minus the number of action dimensions."""
+    bc_weight: float = 0.1
+    """Weight of the behaviour cloning loss on demonstration rows (lambda_BC of the thesis)."""
+    bc_loss: Literal["squared", "norm"] = "squared"
+    """Squared distance to the demonstrated action (thesis), or its square root per row (original code)."""
+    bc_action: Literal["mean", "sample"] = "mean"
+    """Compare the policy's mean action (thesis) or a sampled one (original code) with the demonstrated action."""
+    policy_input: Literal["observation_goal", "achieved_desired_observation"] = "observation_goal"
+    """What the networks see; the second form repeats the achieved goal, as the thesis's framework does."""
+
+    def __post_init__(self) -> None:
+        _check_types(self)
+        _check(
+            self,
+            net_arch=(len(self.net_arch) >= 1 and all(width >= 1 for width in self.net_arch), "one or more widths, each at least 1"),
+            learning_rate=(self.learning_rate > 0.0, "greater than 0"),
+            num_critics=(self.num_critics >= 1, "at least 1"),
+            num_quantiles=(self.num_quantiles >= 1, "at least 1"),
+            top_quantiles_to_drop_per_net=(
+                0 <= self.top_quantiles_to_drop_per_net < self.num_quantiles,
+                f"between 0 and num_quantiles - 1 = {self.num_quantiles - 1}",
+            ),
+            target_update_rate=(0.0 < self.target_update_rate <= 1.0, "in (0, 1]"),
+            initial_alpha=(self.initial_alpha > 0.0, "greater than 0"),
+            bc_weight=(self.bc_weight >= 0.0, "0 or more"),
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """A whole training run, except the environment and the demonstrations."""
+
+    algo: Algorithm = "hindrl"
+    """Which of the four models: bc, tqcfd (no relabelling), hindrl, smooth-hindrl."""
+    steps: int = 300_000
+    """Environment steps of the run; for bc, which takes none, gradient steps."""
+    num_envs: int = 16
+    """Environments stepped side by side."""
+    updates_per_iteration: int = 2
+    """Gradient steps after each (vectorised) environment step."""
+    learning_starts: int = 1_600
+    """Environment steps with uniformly random actions before the first gradient step."""
+    buffer_size: int = 500_000
+    """Transitions that the replay holds."""
+    eval_every: int = 8_000
+    """Environment steps (bc: gradient steps) between evaluations."""
+    eval_episodes: int = 100
+    """Episodes of each evaluation, with the policy's mean action."""
+    batch: BatchConfig = BatchConfig()
+    goal: GoalConfig = GoalConfig()
+    agent: AgentConfig = AgentConfig()
+
+    def __post_init__(self) -> None:
+        _check_types(self)
+        counts = ("steps", "num_envs", "updates_per_iteration", "buffer_size", "eval_every", "eval_episodes")
+        _check(
+            self,
+            **{name: (getattr(self, name) >= 1, "at least 1") for name in counts},
+            learning_starts=(self.learning_starts >= 0, "0 or more"),
+        )
+        if self.algo != "bc" and self.steps <= self.learning_starts:
+            raise ValueError(f"steps = {self.steps} ends before learning begins: it must be greater than learning_starts = {self.learning_starts}")

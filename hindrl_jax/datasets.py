@@ -1,0 +1,418 @@
+"""Demonstrations on disk: HDF5 files in the layout of robomimic, written atomically and checked in full when read.
+
+    data                      group; attributes env_args, env, total, format_version, expert
+      demo_0                  group; attribute num_samples = L, the number of transitions
+        obs/observation       (L, D) o_t
+        obs/achieved_goal     (L, G) Phi(o_t)
+        obs/desired_goal      (L, G) the goal that the episode was acted under
+        next_obs/...          the same three for o_{t+1}, so that row t of all datasets is one transition (o_t, a_t, r_t, o_{t+1})
+        actions               (L, A) float32 in the policy's range [-1, 1], which is also what robomimic expects
+        rewards               (L,)
+        dones                 (L,) 1 at the last step of a demonstration that solved its task, else 0
+        states                (L, S) simulator state before each action, for rendering
+        final_state           (S,) simulator state after the last action (robomimic has no place for it)
+      demo_1 ...
+
+`env_args` is the JSON text of {"env_name", "env_type", "env_kwargs"}. `env_type` is robomimic's number for the family of an environment:
+1 robosuite, 2 gym, 3 iGibson. It is 2 here, since ours are built from a name and keyword arguments, as gym environments are.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import json
+import os
+import re
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from hindrl_jax.errors import UserError
+from hindrl_jax.types import Environment, Episodes
+
+FORMAT_VERSION = 1
+_GYM_ENV_TYPE = 2
+_ACTION_TOLERANCE = 1e-5
+_GOAL_TOLERANCE = 1e-4
+_OBSERVATION_KEYS = ("observation", "achieved_goal", "desired_goal")
+_RECORD_AGAIN = "record the demonstrations again"
+
+
+@dataclasses.dataclass(frozen=True)
+class DemonstrationSummary:
+    """What a file of demonstrations holds. Ranges are per dimension, over all steps of all demonstrations."""
+
+    path: Path
+    env_name: str
+    env_kwargs: dict[str, Any]
+    expert: dict[str, Any] | None
+    num_demonstrations: int
+    num_transitions: int
+    num_solved: int
+    length_min: int
+    length_median: float
+    length_max: int
+    observation_low: np.ndarray  # (D,)
+    observation_high: np.ndarray  # (D,)
+    action_low: np.ndarray  # (A,)
+    action_high: np.ndarray  # (A,)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Demonstration:
+    """One checked demonstration of L transitions."""
+
+    name: str
+    observations: np.ndarray  # (L + 1, D)
+    achieved_goals: np.ndarray  # (L + 1, G)
+    desired_goal: np.ndarray  # (G,)
+    actions: np.ndarray  # (L, A)
+    rewards: np.ndarray  # (L,)
+    terminated: bool
+    states: np.ndarray  # (L + 1, S)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Header:
+    """The attributes of the group `data`, and which demonstrations there are."""
+
+    env_name: str
+    env_kwargs: dict[str, Any]
+    expert: dict[str, Any] | None
+    lengths: dict[str, int]  # name of each demonstration, in numeric order -> number of transitions
+
+
+def save_demonstrations(
+    path: str | os.PathLike[str],
+    demonstrations: Episodes,
+    *,
+    states: np.ndarray,
+    env: Environment,
+    env_args: dict[str, Any],
+    expert: dict[str, Any] | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Writes demonstrations to `path`, which afterwards holds either all of them or what it held before.
+
+    The data passes the checks of `load_demonstrations`, goes to a temporary file in the same folder, and takes its name only when it is on disk.
+
+    Args:
+      path: the file to write; missing folders are made.
+      demonstrations: a table of N episodes, as NumPy or JAX arrays.
+      states: (N, T + 1, S) flat simulator states along each episode, for rendering.
+      env: the environment that the demonstrations were recorded in.
+      env_args: arguments that build this environment again, usually `dataclasses.asdict(env)`; must be convertible to JSON.
+      expert: name and settings of the expert, for the record; must be convertible to JSON.
+      overwrite: whether an existing file may be replaced.
+
+    Raises:
+      UserError: the file exists and `overwrite` is off, it cannot be written, or its content would be refused by `load_demonstrations`.
+      ValueError: `states` does not go with the table of episodes.
+    """
+    path = Path(path)
+    table = Episodes(**{field.name: np.asarray(getattr(demonstrations, field.name)) for field in dataclasses.fields(Episodes)})
+    states = np.asarray(states)
+    if states.ndim != 3 or states.shape[:2] != table.observations.shape[:2]:
+        raise ValueError(f"states must have shape {(*table.observations.shape[:2], 'S')}, found {states.shape}")
+    achieved_goals = np.asarray(env.achieved_goal(table.observations))
+
+    def write(file: h5py.File) -> None:
+        data = file.create_group("data")
+        data.attrs["env_args"] = _json_bytes({"env_name": env.name, "env_type": _GYM_ENV_TYPE, "env_kwargs": env_args})
+        data.attrs["env"] = np.bytes_(env.name.encode())
+        data.attrs["total"] = int(table.lengths.sum())
+        data.attrs["format_version"] = FORMAT_VERSION
+        data.attrs["expert"] = _json_bytes(expert)
+        for i, length in enumerate(table.lengths.tolist()):
+            demo = data.create_group(f"demo_{i}")
+            demo.attrs["num_samples"] = length
+            along = {
+                "observation": table.observations[i].astype(np.float32),
+                "achieved_goal": achieved_goals[i].astype(np.float32),
+                "desired_goal": np.broadcast_to(table.desired_goals[i].astype(np.float32), achieved_goals[i].shape),
+            }
+            for key in _OBSERVATION_KEYS:
+                demo[f"obs/{key}"] = along[key][:length]
+                demo[f"next_obs/{key}"] = along[key][1 : length + 1]
+            demo["actions"] = table.actions[i, :length].astype(np.float32)
+            demo["rewards"] = table.rewards[i, :length].astype(np.float32)
+            demo["dones"] = (np.arange(length) == length - 1).astype(np.int64) * int(table.terminated[i])
+            demo["states"] = states[i, :length]
+            demo["final_state"] = states[i, length]
+
+    def refuse_existing() -> None:
+        if path.is_dir():
+            raise UserError(f"{path}: is a folder; name a file")
+        if path.exists() and not overwrite:
+            raise UserError(f"{path}: exists already; allow overwriting it or choose another name")
+
+    # The HDF5 library may crash the whole process when a disk is full, so it writes to memory, and plain Python writes the bytes.
+    refuse_existing()
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        write(file)
+    _check_against_env(path, *_read_file(path, content), env)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(temporary, "wb") as file:
+            file.write(content.getbuffer())
+            file.flush()
+            os.fsync(file.fileno())  # else a power cut soon after the renaming could leave an empty file under the final name
+        refuse_existing()  # somebody else may have been quicker
+        os.replace(temporary, path)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written ({_one_line(error)}); check the folder, its permissions and the free space") from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+
+
+def load_demonstrations(path: str | os.PathLike[str], env: Environment, *, num_demos: int | None = None) -> Episodes:
+    """Reads demonstrations as a table padded with zeros to the horizon of `env`, NumPy arrays throughout.
+
+    Demonstrations longer than the horizon are dropped with a warning. They stand in the numeric order of their names.
+
+    Args:
+      path: a file written by `save_demonstrations`.
+      env: the environment to learn in. It must be the one recorded in the file, with equal arguments; only the horizon may differ.
+      num_demos: how many to take, the first of those that fit into the horizon; None takes all.
+
+    Raises:
+      UserError: the file is missing, damaged, inconsistent or of another environment, or holds too few demonstrations.
+    """
+    path = Path(path)
+    if num_demos is not None and num_demos < 1:
+        raise UserError(f"{path}: {num_demos} demonstrations asked for; ask for at least 1")
+    header, demos = _read(path, max_length=env.horizon, num_demos=num_demos)
+    num_dropped = sum(length > env.horizon for length in header.lengths.values())
+    num_usable = len(header.lengths) - num_dropped
+    if num_usable == 0:
+        raise UserError(f"{path}: all {num_dropped} demonstrations are longer than the horizon of {env.horizon} steps; raise the horizon")
+    if num_demos is not None and num_demos > num_usable:
+        fit = f" that fit into the horizon of {env.horizon} steps" if num_dropped else ""
+        raise UserError(f"{path}: {num_demos} demonstrations asked for, but it holds {num_usable}{fit}; ask for fewer or record more")
+    _check_against_env(path, header, demos, env)
+    if num_dropped:
+        warnings.warn(
+            f"{path}: dropped {num_dropped} of {len(header.lengths)} demonstrations, longer than the horizon of {env.horizon} steps", stacklevel=2
+        )
+
+    def padded(rows: list[np.ndarray], num_rows: int) -> np.ndarray:
+        out = np.zeros((len(rows), num_rows, *rows[0].shape[1:]), np.float32)
+        for i, row in enumerate(rows):
+            out[i, : len(row)] = row
+        return out
+
+    return Episodes(
+        observations=padded([demo.observations for demo in demos], env.horizon + 1),
+        actions=padded([demo.actions for demo in demos], env.horizon),
+        rewards=padded([demo.rewards for demo in demos], env.horizon),
+        lengths=np.array([len(demo.actions) for demo in demos], np.int32),
+        terminated=np.array([demo.terminated for demo in demos], bool),
+        desired_goals=np.stack([demo.desired_goal for demo in demos]),
+    )
+
+
+def read_states(path: str | os.PathLike[str], *, num_demos: int | None = None) -> list[np.ndarray]:
+    """The simulator states along each demonstration, (length + 1, S) each, in the type that they were written in; for rendering."""
+    _, demos = _read(Path(path), num_demos=num_demos)
+    return [demo.states for demo in demos]
+
+
+def describe_demonstrations(path: str | os.PathLike[str]) -> DemonstrationSummary:
+    """Reads and checks a whole file, without the environment that it was recorded in."""
+    path = Path(path)
+    header, demos = _read(path)
+    lengths = [len(demo.actions) for demo in demos]
+    observations = np.concatenate([demo.observations for demo in demos])
+    actions = np.concatenate([demo.actions for demo in demos])
+    return DemonstrationSummary(
+        path=path,
+        env_name=header.env_name,
+        env_kwargs=header.env_kwargs,
+        expert=header.expert,
+        num_demonstrations=len(demos),
+        num_transitions=sum(lengths),
+        num_solved=sum(demo.terminated for demo in demos),
+        length_min=min(lengths),
+        length_median=float(np.median(lengths)),
+        length_max=max(lengths),
+        observation_low=observations.min(axis=0),
+        observation_high=observations.max(axis=0),
+        action_low=actions.min(axis=0),
+        action_high=actions.max(axis=0),
+    )
+
+
+def _read(path: Path, *, max_length: int | None = None, num_demos: int | None = None) -> tuple[_Header, list[_Demonstration]]:
+    """Reads the header and the first `num_demos` demonstrations of at most `max_length` transitions; checks all that needs no environment."""
+    if not path.exists():
+        raise UserError(f"{path}: no such file; check the name or record demonstrations there")
+    if not path.is_file():
+        raise UserError(f"{path}: is not a file; name a file of demonstrations")
+    return _read_file(path, path, max_length=max_length, num_demos=num_demos)
+
+
+def _read_file(
+    path: Path, source: Path | io.BytesIO, *, max_length: int | None = None, num_demos: int | None = None
+) -> tuple[_Header, list[_Demonstration]]:
+    with _damage_reported(f"{path}", "is not an HDF5 file, or is cut off or damaged"), h5py.File(source, "r", locking="best-effort") as file:
+        if not isinstance(file.get("data"), h5py.Group):
+            raise UserError(f"{path}: has no group 'data', so it holds no demonstrations; name a file of demonstrations")
+        header = _read_header(path, file["data"])
+        names = [name for name, length in header.lengths.items() if max_length is None or length <= max_length]
+        demos = [_read_demonstration(path, name, file["data"][name], header.lengths[name]) for name in names[:num_demos]]
+    for demo in demos:
+        for what in ("observations", "actions", "achieved_goals", "states"):
+            here, first = (getattr(d, what).shape[1:] for d in (demo, demos[0]))
+            if here != first:
+                what = what.replace("_", " ")
+                raise UserError(f"{path}: {demo.name}: {what} have shape {here} per step but {first} in {demos[0].name}; {_RECORD_AGAIN}")
+    return header, demos
+
+
+def _read_header(path: Path, data: h5py.Group) -> _Header:
+    version = _attribute(f"{path}", data, "format_version")
+    if int(version) != FORMAT_VERSION:
+        raise UserError(f"{path}: has format version {version}, but this version of hindrl_jax reads {FORMAT_VERSION}; {_RECORD_AGAIN}")
+    try:
+        env_args = json.loads(_attribute(f"{path}", data, "env_args"))
+        env_name, env_kwargs = str(env_args["env_name"]), dict(env_args["env_kwargs"])
+        expert = json.loads(data.attrs.get("expert", "null"))
+    except (TypeError, KeyError, json.JSONDecodeError) as error:
+        raise UserError(f"{path}: the attribute env_args or expert is not the JSON text that was expected; {_RECORD_AGAIN}") from error
+    names = sorted((name for name in data if re.fullmatch(r"demo_\d+", name)), key=lambda name: int(name.removeprefix("demo_")))
+    if not names:
+        raise UserError(f"{path}: holds no demonstrations; {_RECORD_AGAIN}")
+    lengths = {}
+    for name in names:
+        where = f"{path}: {name}"
+        if not isinstance(data[name], h5py.Group):
+            raise UserError(f"{where}: is not a group; {_RECORD_AGAIN}")
+        lengths[name] = int(_attribute(where, data[name], "num_samples"))
+        if lengths[name] < 1:
+            raise UserError(f"{where}: has {lengths[name]} transitions, at least 1 is needed; delete this demonstration or {_RECORD_AGAIN}")
+    return _Header(env_name=env_name, env_kwargs=env_kwargs, expert=expert, lengths=lengths)
+
+
+def _read_demonstration(path: Path, name: str, group: h5py.Group, length: int) -> _Demonstration:
+    where = f"{path}: {name}"
+    along = {}
+    for key in _OBSERVATION_KEYS:
+        before = _array(where, group, f"obs/{key}", (length, None))
+        after = _array(where, group, f"next_obs/{key}", (length, before.shape[1]))
+        misaligned = np.flatnonzero((after[:-1] != before[1:]).any(axis=1))
+        if misaligned.size:
+            t = misaligned[0]
+            raise UserError(f"{where}: row {t} of next_obs/{key} is not row {t + 1} of obs/{key}, the rows are misaligned; {_RECORD_AGAIN}")
+        along[key] = np.concatenate([before, after[-1:]])
+    if (along["desired_goal"] != along["desired_goal"][0]).any():
+        raise UserError(f"{where}: desired_goal changes during the episode, which is not supported; record with one goal per demonstration")
+    if along["achieved_goal"].shape != along["desired_goal"].shape:
+        raise UserError(f"{where}: achieved_goal and desired_goal differ in shape; {_RECORD_AGAIN}")
+
+    actions = _array(where, group, "actions", (length, None))
+    largest = np.abs(actions).max(initial=0.0)
+    if largest > 1.0 + _ACTION_TOLERANCE:
+        raise UserError(f"{where}: actions reach {largest:g} in size but must lie in [-1, 1]; rescale them from the environment's units")
+    dones = _array(where, group, "dones", (length,))
+    if dones[:-1].any() or dones[-1] not in (0, 1):
+        raise UserError(f"{where}: dones must be 0, or 1 at the last step only; cut the demonstration there or {_RECORD_AGAIN}")
+    states = _array(where, group, "states", (length, None), dtype=None)
+    final_state = _array(where, group, "final_state", (states.shape[1],), dtype=None)
+    return _Demonstration(
+        name=name,
+        observations=along["observation"],
+        achieved_goals=along["achieved_goal"],
+        desired_goal=along["desired_goal"][0],
+        actions=actions,
+        rewards=_array(where, group, "rewards", (length,)),
+        terminated=bool(dones[-1]),
+        states=np.concatenate([states, final_state[None]]),
+    )
+
+
+def _check_against_env(path: Path, header: _Header, demos: list[_Demonstration], env: Environment) -> None:
+    if header.env_name != env.name:
+        raise UserError(f"{path}: was recorded in {header.env_name}, not in {env.name}; name a file of {env.name} or train in {header.env_name}")
+    if dataclasses.is_dataclass(env):
+        expected, missing = _plain(dataclasses.asdict(env)), "nothing"
+        for field in sorted((expected.keys() | header.env_kwargs.keys()) - {"horizon"}):
+            there, here = header.env_kwargs.get(field, missing), expected.get(field, missing)
+            if there != here:
+                raise UserError(
+                    f"{path}: was recorded with {field} = {there}, but {env.name} here has {field} = {here}; use equal arguments or {_RECORD_AGAIN}"
+                )
+    dims = {"observations": env.observation_dim, "actions": env.action_dim, "achieved_goals": env.goal_dim}
+    for demo in demos:
+        for what, dim in dims.items():
+            if getattr(demo, what).shape[1] != dim:
+                found, what = getattr(demo, what).shape[1], what.replace("_", " ")
+                raise UserError(f"{path}: {demo.name}: {what} have {found} dimensions, but {dim} in {env.name}; {_RECORD_AGAIN}")
+    # One call for the whole file: under JAX, one per demonstration would compile for every length.
+    owners = np.repeat(np.arange(len(demos)), [len(demo.observations) for demo in demos])
+    expected_goals = np.asarray(env.achieved_goal(np.concatenate([demo.observations for demo in demos])))
+    stored_goals = np.concatenate([demo.achieved_goals for demo in demos])
+    wrong = ~np.isclose(stored_goals, expected_goals, rtol=_GOAL_TOLERANCE, atol=_GOAL_TOLERANCE).all(axis=1)
+    if wrong.any():
+        name = demos[owners[wrong.argmax()]].name
+        raise UserError(f"{path}: {name}: achieved_goal is not what {env.name} derives from the observations; {_RECORD_AGAIN}")
+
+
+def _array(where: str, group: h5py.Group, name: str, shape: tuple[int | None, ...], dtype: Any = np.float32) -> np.ndarray:
+    """Reads a dataset of finite numbers; None in `shape` stands for any size, `dtype` None keeps the type in the file."""
+    with _damage_reported(where, f"{name} cannot be read"):
+        dataset = group.get(name)
+        if not isinstance(dataset, h5py.Dataset):
+            raise UserError(f"{where}: dataset {name} is missing; {_RECORD_AGAIN}")
+        # Before any reading, since a damaged shape may be too large for the memory.
+        if len(dataset.shape) != len(shape) or any(b is not None and a != b for a, b in zip(dataset.shape, shape, strict=True)):
+            wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
+            raise UserError(f"{where}: {name} has shape {dataset.shape}, expected {wanted}; {_RECORD_AGAIN}")
+        if dataset.dtype.kind not in "biuf":
+            raise UserError(f"{where}: {name} holds {dataset.dtype}, not numbers; {_RECORD_AGAIN}")
+        array = np.asarray(dataset[()])
+    finite = np.isfinite(array)
+    if not finite.all():
+        row = np.argwhere(~finite)[0][0]
+        raise UserError(f"{where}: {name} is not finite in row {row}; delete this demonstration or {_RECORD_AGAIN}")
+    return array if dtype is None else array.astype(dtype)
+
+
+def _attribute(where: str, group: h5py.Group, name: str) -> Any:
+    with _damage_reported(where, f"attribute {name} cannot be read"):
+        if name not in group.attrs:
+            raise UserError(f"{where}: attribute {name} is missing, so this is no file of hindrl_jax demonstrations; {_RECORD_AGAIN}")
+        return group.attrs[name]
+
+
+@contextlib.contextmanager
+def _damage_reported(where: str, what: str) -> Iterator[None]:
+    """Turns whatever h5py raises on a damaged file into a UserError; which exception it is depends on the place of the damage."""
+    try:
+        yield
+    except UserError:
+        raise
+    except (OSError, KeyError, RuntimeError, TypeError, ValueError, MemoryError) as error:
+        raise UserError(f"{where}: {what} ({_one_line(error)}); fetch the file again or {_RECORD_AGAIN}") from error
+
+
+def _plain(value: Any) -> Any:
+    """The value as it comes back from JSON: tuples become lists, arrays and NumPy scalars become numbers."""
+    return json.loads(json.dumps(value, default=lambda array: array.tolist()))
+
+
+def _json_bytes(value: Any) -> np.bytes_:
+    """JSON as a string of fixed length: on a damaged file, strings of variable length can crash the HDF5 library."""
+    return np.bytes_(json.dumps(_plain(value)).encode())
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())

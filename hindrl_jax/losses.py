@@ -1,0 +1,148 @@
+"""Losses of TQC (Kuznetsov et al., 2020) and of learning from demonstrations, as functions of arrays.
+
+Atoms (quantiles) lie on the leading axes and the batch on the last: on a CPU that layout, not the arithmetic, decides the speed.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from hindrl_jax.types import Array
+
+
+def quantile_midpoints(num_quantiles: int) -> Array:
+    """Midpoints (2 i + 1) / (2 Q) of the Q quantile intervals, i = 0 .. Q - 1 (Dabney et al., QR-DQN, 2018, lemma 2): (Q,)."""
+    return (jnp.arange(num_quantiles, dtype=jnp.float32) + 0.5) / num_quantiles
+
+
+def drop_largest(atoms: Array, num_dropped: int) -> Array:
+    """Removes the `num_dropped` largest atoms of each column: the truncation of TQC (2020, eq. 9).
+
+    Every atom is carried past `num_dropped` registers that keep the largest values seen; what falls out at the end is kept. Nothing
+    needs to be sorted, since the loss is symmetric in the target atoms.
+
+    Args:
+      atoms: (M, B).
+      num_dropped: 0 <= num_dropped < M.
+
+    Returns:
+      (M - num_dropped, B), in no particular order.
+
+    Example:
+      >>> sorted(drop_largest(jnp.array([[3.0], [1.0], [4.0], [2.0]]), 2)[:, 0].tolist())
+      [1.0, 2.0]
+    """
+    if num_dropped == 0:
+        return atoms
+
+    def carry_past(largest: tuple[Array, ...], atom: Array) -> tuple[tuple[Array, ...], Array]:
+        registers = []
+        for register in largest:
+            registers.append(jnp.maximum(register, atom))
+            atom = jnp.minimum(register, atom)
+        return tuple(registers), atom
+
+    empty = tuple(jnp.full(atoms.shape[1:], -jnp.inf, atoms.dtype) for _ in range(num_dropped))
+    _, fallen_out = jax.lax.scan(carry_past, empty, atoms)
+    return fallen_out[num_dropped:]
+
+
+def _quantile_huber_sums(quantiles: Array, targets: Array) -> tuple[Array, Array]:
+    """One pass over the target atoms that yields the loss and its gradient: (B,) and (..., Q, B), both averaged over atoms."""
+    num_quantiles, num_targets = quantiles.shape[-2], targets.shape[0]
+    midpoints = quantile_midpoints(num_quantiles).reshape((1,) * (quantiles.ndim - 2) + (num_quantiles, 1)).astype(quantiles.dtype)
+
+    def add_target(sums: tuple[Array, Array], target: Array) -> tuple[tuple[Array, Array], None]:
+        loss, gradient = sums
+        error = target.reshape((1,) * (quantiles.ndim - 1) + target.shape) - quantiles
+        clipped = jnp.clip(error, -1.0, 1.0)
+        weight = jnp.where(error < 0.0, 1.0 - midpoints, midpoints)
+        return (loss + weight * clipped * (error - 0.5 * clipped), gradient - weight * clipped), None
+
+    zeros = jnp.zeros_like(quantiles)
+    (loss, gradient), _ = jax.lax.scan(add_target, (zeros, zeros), targets)
+    scale = 1.0 / (num_quantiles * num_targets)
+    return scale * jnp.sum(loss, axis=-2), scale * gradient
+
+
+@jax.custom_vjp
+def quantile_huber(quantiles: Array, targets: Array) -> Array:
+    """Quantile Huber loss with kappa = 1, averaged over quantiles and target atoms (Dabney et al., 2018, eq. 10).
+
+    With u = target - quantile and midpoint tau: |tau - 1{u < 0}| * (u^2 / 2 if |u| <= 1 else |u| - 1/2). The gradient with respect to
+    the quantiles is computed in the same pass; the targets are constants and get none.
+
+    Args:
+      quantiles: (..., Q, B) predicted quantiles in ascending order of their midpoints.
+      targets: (M, B) target atoms, in any order, the same for all leading axes.
+
+    Returns:
+      (..., B) loss per leading index and batch row.
+
+    Example:
+      >>> quantile_huber(jnp.zeros((25, 1)), jnp.ones((46, 1))).tolist()
+      [0.25]
+    """
+    return _quantile_huber_sums(quantiles, targets)[0]
+
+
+def _quantile_huber_forward(quantiles: Array, targets: Array) -> tuple[Array, tuple[Array, Array]]:
+    loss, gradient = _quantile_huber_sums(quantiles, targets)
+    return loss, (gradient, targets)
+
+
+def _quantile_huber_backward(residuals: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
+    gradient, targets = residuals
+    return gradient * cotangent[..., None, :], jnp.zeros_like(targets)
+
+
+quantile_huber.defvjp(_quantile_huber_forward, _quantile_huber_backward)
+
+
+def target_atoms(next_atoms: Array, *, reward: Array, discount: Array, entropy_bonus: Array, num_dropped: int) -> Array:
+    """Atoms of the distributional Bellman target (Kuznetsov et al., 2020, eq. 10): r + discount * (z + bonus) for each kept atom z.
+
+    Args:
+      next_atoms: (M, B) atoms of all target critics at the next state and action.
+      reward, discount: (B,); the discount is 0 after termination.
+      entropy_bonus: (B,) minus alpha times the log-probability of the next action.
+      num_dropped: how many of the largest atoms are dropped.
+
+    Returns:
+      (M - num_dropped, B), without gradient.
+    """
+    kept = drop_largest(next_atoms, num_dropped)
+    return jax.lax.stop_gradient(reward[None] + discount[None] * (kept + entropy_bonus[None]))
+
+
+def behaviour_cloning(policy_action: Array, demonstrated_action: Array, is_demonstration: Array, *, form: str) -> Array:
+    """Behaviour cloning loss: masked by "is a demonstration row", divided by the whole batch (thesis eq. 2.32).
+
+    Args:
+      policy_action, demonstrated_action: (B, A) in [-1, 1].
+      is_demonstration: (B,) bool, the mask delta^e.
+      form: "squared" for the squared distance (thesis text), "norm" for the distance itself (original code).
+
+    Returns:
+      () loss.
+    """
+    squared = jnp.sum(jnp.square(policy_action - demonstrated_action), axis=-1)
+    loss = squared if form == "squared" else jnp.sqrt(squared + 1e-12)
+    return jnp.mean(jnp.where(is_demonstration, loss, 0.0))
+
+
+def entropy_coefficient(log_alpha: Array, log_prob: Array, *, target_entropy: float) -> Array:
+    """Loss whose gradient raises alpha while the policy's entropy is below the target: -mean(log_alpha (log_prob + target)).
+
+    As in Stable-Baselines3, it is linear in log alpha (Haarnoja et al., SAC applications, 2018, eq. 18, use alpha itself).
+
+    Args:
+      log_alpha: () logarithm of the entropy coefficient.
+      log_prob: (B,) log-probabilities of sampled actions, treated as constants.
+      target_entropy: the entropy aimed at, in nats.
+
+    Returns:
+      () loss.
+    """
+    return -jnp.mean(log_alpha * jax.lax.stop_gradient(log_prob + target_entropy))

@@ -1,0 +1,86 @@
+"""The environments by name, each with its expert and its viewer: the one place where tasks are listed."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import importlib
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+from envs.grid import FixedGridPickAndPlace, GridPickAndPlace
+from experts.grid import GridExpert
+from experts.recording import RecordableEnvironment
+from hindrl_jax.errors import UserError
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """What belongs to one environment name."""
+
+    environment: type[Any]
+    """Frozen dataclass; its fields are the environment's arguments."""
+    expert: type[Any]
+    """Frozen dataclass with a method act(key, env, state)."""
+    viewer_module: str
+    """Module with save_png(env, state, path) and save_gif(env, states, path); imported only to draw."""
+    summary: str
+    """One line for the table of `hindrl envs`."""
+
+
+TASKS: dict[str, Task] = {
+    task.environment.name: task
+    for task in (
+        Task(GridPickAndPlace, GridExpert, "envs.grid.viewer", "objects, agent and goal anywhere on the grid (thesis 3.1.1)"),
+        Task(FixedGridPickAndPlace, GridExpert, "envs.grid.viewer", "each of them within a small box of its own (thesis 3.1.2)"),
+    )
+}
+
+
+def task(name: str) -> Task:
+    """The task of that name.
+
+    Raises:
+      UserError: if there is none; the message lists the names.
+    """
+    if name not in TASKS:
+        raise UserError(f"unknown environment {name!r}{did_you_mean(name, TASKS)}; choose one of {', '.join(TASKS)}")
+    return TASKS[name]
+
+
+def make(name: str, **arguments: Any) -> RecordableEnvironment:
+    """Builds an environment by name.
+
+    Args:
+      name: for example "FixedGridPickAndPlace"; `hindrl envs` lists them.
+      **arguments: fields of the environment, for example num_objects=3.
+
+    Raises:
+      UserError: for an unknown name or argument, or a value that the environment refuses.
+    """
+    environment = task(name).environment
+    known = [field.name for field in dataclasses.fields(environment)]
+    for argument in arguments:
+        if argument not in known:
+            raise UserError(f"{name} has no argument {argument!r}{did_you_mean(argument, known)}; it has {', '.join(known)}")
+    return checked(lambda: environment(**arguments))
+
+
+def viewer(env: RecordableEnvironment) -> ModuleType:
+    """The module that draws this environment."""
+    return importlib.import_module(task(env.name).viewer_module)
+
+
+def checked(build: Callable[[], Any]) -> Any:
+    """Runs a constructor whose ValueErrors are written for the user."""
+    try:
+        return build()
+    except (ValueError, TypeError) as error:
+        raise UserError(str(error)) from error
+
+
+def did_you_mean(word: str, known: Any) -> str:
+    """`; did you mean 'x'?` if something known is close, else nothing."""
+    close = difflib.get_close_matches(word, list(known), n=1)
+    return f" (did you mean {close[0]!r}?)" if close else ""

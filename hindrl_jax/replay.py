@@ -1,0 +1,265 @@
+"""Replay of whole episodes, and the batches that are drawn from it.
+
+A transition is never stored twice: an episode keeps its T + 1 observations once, next observations and achieved goals are read off the
+following rows, and relabelled goals, rewards and n-step returns are computed when a batch is drawn (the thesis's "online relabelling").
+
+Every environment owns a ring of episode slots, so that writing needs no bookkeeping between environments. One slot per ring is being written;
+only complete episodes are sampled, and an episode is overwritten as a whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from hindrl_jax.config import BatchConfig
+from hindrl_jax.goals import GoalTable, goal_reached
+from hindrl_jax.relabel import hindsight_steps, relabelled_goals
+from hindrl_jax.types import Array, Episodes, Transition
+
+
+@struct.dataclass(kw_only=True)
+class ReplayState:
+    """Rings of episodes, one ring of R slots for each of the E environments; slot r of environment e is row e * R + r of `episodes`."""
+
+    episodes: Episodes  # E * R episodes; the length of an incomplete or empty one is 0
+    slot: Array  # (E,) int32, the slot that each environment is writing
+    step: Array  # (E,) int32, transitions already written there
+    num_complete: Array  # (E,) int32, complete episodes in each ring, at most R - 1
+
+
+def init(*, num_envs: int, capacity: int, horizon: int, observation_dim: int, action_dim: int, goal_dim: int) -> ReplayState:
+    """An empty replay.
+
+    Args:
+      num_envs: E.
+      capacity: transitions to hold; rounded down to whole episodes of `horizon` steps per environment.
+      horizon: T, the longest episode.
+      observation_dim, action_dim, goal_dim: D, A, G.
+
+    Raises:
+      ValueError: if the capacity is below two episodes per environment (one being written, one to sample).
+    """
+    slots = capacity // (num_envs * horizon)
+    if slots < 2:
+        raise ValueError(
+            f"buffer_size = {capacity} is too small: {num_envs} environments with episodes of up to {horizon} steps "
+            f"need at least {2 * num_envs * horizon}"
+        )
+    rows = num_envs * slots
+    return ReplayState(
+        episodes=Episodes(
+            observations=jnp.zeros((rows, horizon + 1, observation_dim)),
+            actions=jnp.zeros((rows, horizon, action_dim)),
+            rewards=jnp.zeros((rows, horizon)),
+            lengths=jnp.zeros(rows, jnp.int32),
+            terminated=jnp.zeros(rows, bool),
+            desired_goals=jnp.zeros((rows, goal_dim)),
+        ),
+        slot=jnp.zeros(num_envs, jnp.int32),
+        step=jnp.zeros(num_envs, jnp.int32),
+        num_complete=jnp.zeros(num_envs, jnp.int32),
+    )
+
+
+def add(
+    replay: ReplayState,
+    *,
+    observation: Array,
+    desired_goal: Array,
+    action: Array,
+    reward: Array,
+    next_observation: Array,
+    terminated: Array,
+    truncated: Array,
+) -> ReplayState:
+    """Appends one transition per environment; an episode becomes available for sampling when it ends.
+
+    Args:
+      replay: the state to extend.
+      observation, next_observation: (E, D); the true next observation, not that of the following episode.
+      desired_goal: (E, G), the behavioural goal, constant within an episode.
+      action: (E, A) in [-1, 1].
+      reward: (E,).
+      terminated, truncated: (E,) bool, not both.
+
+    Returns:
+      The new state. The caller donates the old one.
+    """
+    num_envs = replay.slot.shape[0]
+    episodes = replay.episodes
+    slots = episodes.lengths.shape[0] // num_envs
+    row, step, ended = jnp.arange(num_envs) * slots + replay.slot, replay.step, terminated | truncated
+    episodes = episodes.replace(
+        observations=episodes.observations.at[row, step].set(observation).at[row, step + 1].set(next_observation),
+        actions=episodes.actions.at[row, step].set(action),
+        rewards=episodes.rewards.at[row, step].set(reward),
+        lengths=episodes.lengths.at[row].set(jnp.where(ended, step + 1, 0)),
+        terminated=episodes.terminated.at[row].set(terminated),
+        desired_goals=episodes.desired_goals.at[row].set(desired_goal),
+    )
+    return ReplayState(
+        episodes=episodes,
+        slot=jnp.where(ended, (replay.slot + 1) % slots, replay.slot),
+        step=jnp.where(ended, 0, step + 1),
+        num_complete=jnp.minimum(replay.num_complete + ended, slots - 1),
+    )
+
+
+def sample_episodes(key: Array, replay: ReplayState, num_samples: int) -> Array:
+    """Draws complete episodes uniformly, with replacement: (num_samples,) int32 rows of `replay.episodes`.
+
+    At least one episode must be complete; else the rows are meaningless.
+    """
+    slots = replay.episodes.lengths.shape[0] // replay.slot.shape[0]
+    cumulative = jnp.cumsum(replay.num_complete)
+    drawn = jax.random.randint(key, (num_samples,), 0, jnp.maximum(cumulative[-1], 1))
+    env = jnp.searchsorted(cumulative, drawn, side="right", method="compare_all")
+    age = cumulative[env] - drawn  # 1 for the newest episode of that environment
+    return env * slots + (replay.slot[env] - age) % slots
+
+
+def sample_steps(key: Array, episodes: Episodes, rows: Array) -> Array:
+    """Draws a transition uniformly from each of the given episodes: rows (B,) -> steps (B,) int32, 0 <= step < length."""
+    return jax.random.randint(key, rows.shape, 0, jnp.maximum(episodes.lengths[rows], 1))
+
+
+def transitions(
+    episodes: Episodes,
+    rows: Array,
+    steps: Array,
+    *,
+    achieved_goal: Callable[[Array], Array],
+    new_goals: Array,
+    relabelled: Array,
+    epsilon: Array,
+    is_demonstration: bool,
+    config: BatchConfig,
+) -> Transition:
+    """Reads n-step transitions, with the goals and rewards that they were told or have lived.
+
+    The return of row i runs over the steps t, t + 1, ... of its episode. It ends after `n_step` steps, at the end of the episode, or (with
+    `terminate_on_relabel`) where a relabelled goal is reached, whichever comes first. Relabelled rows are rewarded by the box test on the
+    goal achieved after each step (thesis eq. 2.29 and 4.8), the others keep the environment's reward.
+
+    Args:
+      episodes: the table to read.
+      rows, steps: (B,) int32, episode and transition index.
+      achieved_goal: projection of observations (..., D) to goals (..., G).
+      new_goals: (B, G), used where relabelled.
+      relabelled: (B,) bool.
+      epsilon: (G,) half-width of the goal box.
+      is_demonstration: marks the rows for the behaviour cloning loss.
+      config: n_step, gamma and the rules of termination.
+
+    Returns:
+      The batch. Where the return ended by termination the discount is 0, else gamma to the number of steps taken.
+    """
+    lengths, terminated = episodes.lengths[rows], episodes.terminated[rows]
+    if config.timeouts_are_terminal:
+        terminated = jnp.ones_like(terminated)
+    window = steps[:, None] + jnp.arange(config.n_step)[None]  # (B, n)
+    inside = window < lengths[:, None]
+    window = jnp.minimum(window, lengths[:, None] - 1)
+    rewards = episodes.rewards[rows[:, None], window]
+    next_observations = episodes.observations[rows[:, None], window + 1]  # (B, n, D)
+    reached = goal_reached(achieved_goal(next_observations), new_goals[:, None], epsilon, inclusive=config.inclusive_goal_test)
+    reached &= relabelled[:, None]
+    rewards = jnp.where(relabelled[:, None], reached.astype(jnp.float32), rewards)
+
+    ends = (window == lengths[:, None] - 1) & terminated[:, None]
+    if config.terminate_on_relabel:
+        ends |= reached
+    ended_before = jnp.cumsum(ends, axis=1) - ends > 0
+    counted = inside & ~ended_before
+    num_steps = jnp.sum(counted, axis=1)  # (B,), at least 1
+    discounts = config.gamma ** jnp.arange(config.n_step, dtype=jnp.float32)
+    last = (num_steps - 1)[:, None]
+    return Transition(
+        observation=episodes.observations[rows, steps],
+        action=episodes.actions[rows, steps],
+        reward=jnp.sum(jnp.where(counted, rewards * discounts[None], 0.0), axis=1),
+        discount=jnp.where(jnp.take_along_axis(ends, last, axis=1)[:, 0], 0.0, config.gamma**num_steps),
+        next_observation=jnp.take_along_axis(next_observations, last[..., None], axis=1)[:, 0],
+        desired_goal=jnp.where(relabelled[:, None], new_goals, episodes.desired_goals[rows]),
+        is_demonstration=jnp.full(rows.shape, is_demonstration),
+    )
+
+
+def num_demo_rows(env_steps: Array, config: BatchConfig) -> Array:
+    """Demonstration rows of a batch after `env_steps` environment steps: floor(max(r (1 - steps / reach_zero), 0) B) (thesis eq. 4.9)."""
+    if config.reach_zero is None:
+        return jnp.asarray(config.max_demo_rows)
+    remaining = jnp.maximum(1.0 - env_steps / config.reach_zero, 0.0)
+    return jnp.minimum(jnp.floor(config.max_demo_ratio * config.batch_size * remaining).astype(jnp.int32), config.max_demo_rows)
+
+
+def sample_batch(
+    key: Array,
+    replay: ReplayState,
+    demonstrations: Episodes,
+    table: GoalTable,
+    *,
+    achieved_goal: Callable[[Array], Array],
+    epsilon: Array,
+    demo_rows: Array,
+    config: BatchConfig,
+) -> Transition:
+    """Draws the batch of one gradient step: demonstrations, then relabelled replay rows, then replay rows as they were lived.
+
+    Of B rows, `demo_rows` come from the demonstrations; of the rest, n / (n + 1) (rounded down) are relabelled.
+
+    Args:
+      key: random key.
+      replay: at least one complete episode.
+      demonstrations: N episodes; drawn uniformly by episode, then by step, and never relabelled.
+      table: demonstration goals for the task-conditioned strategies.
+      achieved_goal: projection of observations (..., D) to goals (..., G).
+      epsilon: (G,) half-width of the goal box.
+      demo_rows: () int32, see `num_demo_rows`.
+      config: batch size, relabelled share, strategy, n-step.
+
+    Returns:
+      A batch of `config.batch_size` rows in that order.
+    """
+    key_demo, key_demo_step, key_episode, key_step, key_hindsight, key_goal = jax.random.split(key, 6)
+    size, num_demos = config.batch_size, demonstrations.lengths.shape[0]
+
+    rows = sample_episodes(key_episode, replay, size)
+    steps = sample_steps(key_step, replay.episodes, rows)
+    relabelled_rows = (size - demo_rows) * config.num_sampled_goals // (config.num_sampled_goals + 1)
+    index = jnp.arange(size)
+    relabelled = (index >= demo_rows) & (index < demo_rows + relabelled_rows)
+    new_goals = replay.episodes.desired_goals[rows]
+    strategy = config.hindrl_sampling_strategy
+    if config.num_sampled_goals > 0:
+        if strategy != "task_conditioned":
+            own = "future" if strategy == "joint_union" else strategy
+            own_steps = hindsight_steps(key_hindsight, steps, replay.episodes.lengths[rows], strategy=own)
+            new_goals = achieved_goal(replay.episodes.observations[rows, own_steps])
+        new_goals = relabelled_goals(key_goal, table, new_goals, strategy=strategy, union_sampling_ratio=config.union_sampling_ratio)
+    read = dict(achieved_goal=achieved_goal, epsilon=epsilon, config=config)
+    batch = transitions(replay.episodes, rows, steps, new_goals=new_goals, relabelled=relabelled, is_demonstration=False, **read)
+    if config.max_demo_rows == 0:
+        return batch
+
+    demo = jax.random.randint(key_demo, (config.max_demo_rows,), 0, num_demos)
+    demo_batch = transitions(
+        demonstrations,
+        demo,
+        sample_steps(key_demo_step, demonstrations, demo),
+        new_goals=demonstrations.desired_goals[demo],
+        relabelled=jnp.zeros(demo.shape, bool),
+        is_demonstration=True,
+        **read,
+    )
+    use_demo = index[: config.max_demo_rows] < demo_rows
+
+    def merge(demo_leaf: Array, leaf: Array) -> Array:
+        head = leaf[: config.max_demo_rows]
+        return leaf.at[: config.max_demo_rows].set(jnp.where(use_demo.reshape((-1,) + (1,) * (leaf.ndim - 1)), demo_leaf, head))
+
+    return jax.tree.map(merge, demo_batch, batch)

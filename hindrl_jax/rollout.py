@@ -1,0 +1,85 @@
+"""Stepping many environments side by side, for experience and for evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from hindrl_jax.goals import GoalTable, sample_goals
+from hindrl_jax.types import Array, Environment, TimeStep, action_to_env, tree_where
+
+Act = Callable[[Array, Array, Array], Array]
+"""(key, observations (E, D), desired goals (E, G)) -> actions (E, A) in [-1, 1]."""
+
+
+@struct.dataclass(kw_only=True)
+class RolloutState:
+    """E environments in the middle of their episodes."""
+
+    env_state: Any  # leaves (E, ...)
+    observation: Array  # (E, D)
+    desired_goal: Array  # (E, G), the behavioural goals
+
+
+def reset(key: Array, env: Environment, behavioural_goals: GoalTable, num_envs: int) -> RolloutState:
+    """Starts `num_envs` episodes, each with a goal drawn from the table (thesis algorithm 5)."""
+    key_env, key_goal = jax.random.split(key)
+    env_state, observation = jax.vmap(env.reset)(jax.random.split(key_env, num_envs))
+    return RolloutState(env_state=env_state, observation=observation, desired_goal=sample_goals(key_goal, behavioural_goals, num_envs))
+
+
+def step(key: Array, rollout: RolloutState, action: Array, env: Environment, behavioural_goals: GoalTable) -> tuple[RolloutState, TimeStep]:
+    """Steps every environment and starts a new episode where one has ended.
+
+    Args:
+      key: used by the new episodes.
+      rollout: E environments.
+      action: (E, A) in [-1, 1].
+      env: static.
+      behavioural_goals: goals for the new episodes.
+
+    Returns:
+      The new state, and the time steps (E, ...) before the resets: their observation is the true next one.
+    """
+    env_state, time_step = jax.vmap(env.step)(rollout.env_state, action_to_env(action, env))
+    continued = rollout.replace(env_state=env_state, observation=time_step.observation)
+    restarted = reset(key, env, behavioural_goals, action.shape[0])
+    return tree_where(time_step.terminated | time_step.truncated, restarted, continued), time_step
+
+
+@struct.dataclass(kw_only=True)
+class Evaluation:
+    """What became of a number of fresh episodes."""
+
+    success: Array  # (episodes,) bool
+    length: Array  # (episodes,) int32, steps taken
+
+
+def evaluate(key: Array, env: Environment, behavioural_goals: GoalTable, act: Act, num_episodes: int) -> Evaluation:
+    """Plays fresh episodes to their end; an episode is a success if any of its rewards is positive.
+
+    Args:
+      key: random key.
+      env: static.
+      behavioural_goals: each episode draws its goal from here.
+      act: the policy; it is given keys, and may ignore them.
+      num_episodes: played side by side.
+    """
+    key_reset, key_act = jax.random.split(key)
+    start = reset(key_reset, env, behavioural_goals, num_episodes)
+    result = Evaluation(success=jnp.zeros(num_episodes, bool), length=jnp.zeros(num_episodes, jnp.int32))
+
+    def one_step(carry: tuple[Any, Array, Array, Evaluation], key: Array) -> tuple[tuple[Any, Array, Array, Evaluation], None]:
+        env_state, observation, over, result = carry
+        action = act(key, observation, start.desired_goal)
+        env_state, time_step = jax.vmap(env.step)(env_state, action_to_env(action, env))
+        result = Evaluation(success=result.success | (~over & (time_step.reward > 0.0)), length=result.length + ~over)
+        return (env_state, time_step.observation, over | time_step.terminated | time_step.truncated, result), None
+
+    carry = (start.env_state, start.observation, jnp.zeros(num_episodes, bool), result)
+    (_, _, _, result), _ = jax.lax.scan(one_step, carry, jax.random.split(key_act, env.horizon))
+    return result

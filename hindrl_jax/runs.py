@@ -1,0 +1,333 @@
+"""A run's directory: what it was asked to do, how it went, and the policies that came of it.
+
+config.json       everything needed to run it again (`hindrl train --config`)
+metrics.csv       a row per evaluation and seed, written as the run goes
+summary.json      the outcome per seed and the totals
+parameters.npz    networks and behavioural goals, leading axis the seeds; no pickle
+curve.png, episode.gif
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import os
+import resource
+import sys
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
+
+from experts.recording import RecordableEnvironment, play
+from hindrl_jax import plots, rollout
+from hindrl_jax import train as training
+from hindrl_jax.config import TrainConfig
+from hindrl_jax.errors import UserError
+from hindrl_jax.experiment import Result, Row
+from hindrl_jax.goals import GoalTable
+from hindrl_jax.registry import did_you_mean, make, viewer
+from hindrl_jax.types import action_to_env
+
+CONFIG, METRICS, SUMMARY, PARAMETERS = "config.json", "metrics.csv", "summary.json", "parameters.npz"
+CURVE, EPISODE = "curve.png", "episode.gif"
+_ROW_FIELDS = [field.name for field in dataclasses.fields(Row) if field.name != "metrics"]
+
+
+@dataclasses.dataclass(frozen=True)
+class RunSpec:
+    """Everything that a run was asked to do."""
+
+    env: RecordableEnvironment
+    config: TrainConfig
+    demos: str
+    """A number of demonstrations to record for each seed, or the path of a file."""
+    seeds: tuple[int, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data for `config.json`."""
+        return {
+            "env": self.env.name,
+            "env_args": dataclasses.asdict(self.env),
+            "demos": self.demos,
+            "seeds": list(self.seeds),
+            "config": dataclasses.asdict(self.config),
+        }
+
+    @staticmethod
+    def from_json(data: Any, where: Path) -> RunSpec:
+        """The inverse of `to_json`.
+
+        Raises:
+          UserError: naming the file and the first field that is missing, unknown or unusable.
+        """
+        known = ("env", "env_args", "demos", "seeds", "config")
+        if not isinstance(data, dict):
+            raise UserError(f"{where} does not hold a run's configuration: use a config.json that `hindrl train` wrote")
+        _refuse_unknown(data, known, where)
+        for name in known:
+            if name not in data:
+                raise UserError(f"{where} lacks {name!r}: use a config.json that `hindrl train` wrote")
+        seeds, env_args = data["seeds"], data["env_args"]
+        if not isinstance(env_args, dict):
+            raise UserError(f"{where}: env_args = {env_args!r} is not usable: it must be an object of the environment's arguments")
+        if not (isinstance(seeds, list) and seeds and all(type(seed) is int and 0 <= seed < 2**32 for seed in seeds)):
+            raise UserError(f"{where}: seeds = {seeds!r} is not usable: it must be a list of whole numbers from 0 to {2**32 - 1}")
+        return RunSpec(
+            env=make(str(data["env"]), **env_args),
+            config=_config_from_dict(TrainConfig, data["config"], where),
+            demos=str(data["demos"]),
+            seeds=tuple(seeds),
+        )
+
+
+def read_spec(path: Path) -> RunSpec:
+    """Reads a run's `config.json`; `path` is the file or the run's directory.
+
+    Raises:
+      UserError: if it is not there or not usable.
+    """
+    path = path / CONFIG if path.is_dir() else path
+    try:
+        data = json.loads(path.read_text())
+    except FileNotFoundError:
+        raise UserError(f"{path} does not exist: give the directory of a run, or its {CONFIG}") from None
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise UserError(f"{path} cannot be read as JSON ({str(error).splitlines()[0]}): use a {CONFIG} that `hindrl train` wrote") from error
+    return RunSpec.from_json(data, path)
+
+
+def _config_from_dict(config_class: type[Any], data: Any, where: Path) -> Any:
+    if not isinstance(data, dict):
+        raise UserError(f"{where}: {config_class.__name__} is {data!r}, not an object of fields")
+    hints = get_type_hints(config_class)
+    _refuse_unknown(data, hints, where)
+    values = {}
+    for name, value in data.items():
+        if dataclasses.is_dataclass(hints[name]):
+            values[name] = _config_from_dict(hints[name], value, where)
+        else:
+            values[name] = tuple(value) if isinstance(value, list) and get_args(hints[name]) else value
+    try:
+        return config_class(**values)
+    except ValueError as error:
+        raise UserError(f"{where}: {error}") from error
+
+
+def _refuse_unknown(data: dict[str, Any], known: Any, where: Path) -> None:
+    for name in data:
+        if name not in known:
+            raise UserError(f"{where} has an unknown field {name!r}{did_you_mean(name, known)}; it may have {', '.join(known)}")
+
+
+class RunWriter:
+    """Writes a run's directory, file by file, as the run goes. Use `save_run` for a run that is already finished."""
+
+    def __init__(self, path: Path, spec: RunSpec, *, overwrite: bool):
+        """Only checks; nothing is written or removed before `start`.
+
+        Raises:
+          UserError: if the path is a file, or holds a run and `overwrite` is off.
+        """
+        self.path, self.spec = path, spec
+        if path.exists() and not path.is_dir():
+            raise UserError(f"{path} is a file: choose another --out")
+        if (path / CONFIG).exists() and not overwrite:
+            raise UserError(f"{path} already holds a run: choose another --out, or replace it with --overwrite")
+        self._rows_written = 0
+
+    def start(self) -> None:
+        """Removes what an earlier run left, then writes the configuration.
+
+        Raises:
+          UserError: if the directory cannot be written.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            for name in (CONFIG, METRICS, SUMMARY, PARAMETERS, CURVE, EPISODE):
+                (self.path / name).unlink(missing_ok=True)
+            _write_atomically(self.path / CONFIG, json.dumps(self.spec.to_json(), indent=2) + "\n")
+        except OSError as error:
+            raise UserError(f"cannot write {self.path} ({error.strerror}): choose another --out") from error
+
+    def report(self, result: Result) -> None:
+        """Appends the evaluations that are new since the last call to `metrics.csv`."""
+        rows = result.rows[self._rows_written :]
+        if not rows:
+            return
+        fields = [*_ROW_FIELDS, *rows[0].metrics]
+        with (self.path / METRICS).open("a", newline="") as file:
+            writer = csv.DictWriter(file, fields)
+            if self._rows_written == 0:
+                writer.writeheader()
+            for row in rows:
+                values = {name: getattr(row, name) for name in _ROW_FIELDS} | row.metrics
+                writer.writerow({name: f"{value:.6g}" if isinstance(value, float) else value for name, value in values.items()})
+        self._rows_written += len(rows)
+
+    def finish(self, result: Result) -> dict[str, Any]:
+        """Writes the parameters, the summary, the curve and the film of an episode; returns the summary."""
+        self.report(result)
+        _save_parameters(self.path / PARAMETERS, result)
+        summary = summarise(result)
+        plots.save_curve(result, self.path / CURVE)
+        run = load_run(self.path, summary=summary)
+        run.render(self.path / EPISODE)
+        _write_atomically(self.path / SUMMARY, json.dumps(summary, indent=2) + "\n")
+        return summary
+
+
+def save_run(path: str | os.PathLike[str], result: Result, *, demos: str = "given from Python", overwrite: bool = False) -> dict[str, Any]:
+    """Writes a finished experiment as a run directory, as `hindrl train` does; returns the summary.
+
+    Args:
+      path: the directory.
+      result: from `train`.
+      demos: where the demonstrations came from, a number or a path; needed only to run it again with `hindrl train --config`.
+      overwrite: replace a run that is there.
+
+    Raises:
+      UserError: if the directory already holds a run and `overwrite` is off, or cannot be written.
+    """
+    writer = RunWriter(Path(path), RunSpec(env=result.env, config=result.config, demos=demos, seeds=result.seeds), overwrite=overwrite)
+    writer.start()
+    return writer.finish(result)
+
+
+def summarise(result: Result) -> dict[str, Any]:
+    """The contents of `summary.json`."""
+    seconds, num_seeds = result.train_seconds, len(result.seeds)
+    return {
+        "seeds": [dataclasses.asdict(seed) for seed in result.summaries()],
+        "updates_per_second": num_seeds * result.updates / seconds,
+        "env_steps_per_second": num_seeds * result.env_steps / seconds,
+        "compile_seconds": result.compile_seconds,
+        "train_seconds": seconds,
+        "peak_memory_bytes": peak_memory_bytes(),
+    }
+
+
+def peak_memory_bytes() -> int:
+    """Largest resident memory of this process so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A finished run, read back from its directory."""
+
+    path: Path
+    spec: RunSpec
+    summary: dict[str, Any] | None
+    actors: Any
+    """Parameters of the policies, leaves (S, ...)."""
+    behavioural_goals: GoalTable
+    """Leaves (S, ...)."""
+
+    def evaluate(self, *, episodes: int = 100, key: jax.Array | None = None, stochastic: bool = False) -> list[dict[str, float]]:
+        """Plays fresh episodes with each seed's policy: a list of {seed, success, episode_length}, in order of the seeds."""
+        keys = jax.random.split(jax.random.key(0) if key is None else key, len(self.spec.seeds))
+
+        @jax.jit
+        @jax.vmap
+        def play_episodes(key: jax.Array, actor: Any, goals: GoalTable) -> Any:
+            act = training.make_policy(actor, self.spec.env, self.spec.config, stochastic=stochastic)
+            return rollout.evaluate(key, self.spec.env, goals, act, episodes)
+
+        result = jax.device_get(play_episodes(keys, self.actors, self.behavioural_goals))
+        return [
+            {"seed": seed, "success": float(result.success[i].mean()), "episode_length": float(result.length[i].mean())}
+            for i, seed in enumerate(self.spec.seeds)
+        ]
+
+    def render(self, path: Path, *, seed: int | None = None, key: jax.Array | None = None, stochastic: bool = False) -> bool:
+        """Films one fresh episode of one seed's policy (the first seed's by default); returns whether it solved the task.
+
+        Args:
+          path: a .gif file, or a .png file for the last state alone.
+          seed: one of the run's seeds.
+          key: which episode.
+          stochastic: sample the actions.
+
+        Raises:
+          UserError: if the run has no such seed.
+        """
+        env, config = self.spec.env, self.spec.config
+        seed = self.spec.seeds[0] if seed is None else seed
+        if seed not in self.spec.seeds:
+            raise UserError(f"{self.path} has no seed {seed}: choose one of {', '.join(map(str, self.spec.seeds))}")
+        index = self.spec.seeds.index(seed)
+        actor, goals = jax.tree.map(lambda leaf: leaf[index], (self.actors, self.behavioural_goals))
+        policy = training.make_policy(actor, env, config, stochastic=stochastic)
+
+        def act(key: jax.Array, state: Any, observation: jax.Array) -> jax.Array:
+            return action_to_env(policy(key, observation[None], goals.goals[:1])[0], env)
+
+        recording = jax.jit(lambda key: play(key, env, act, 1))(jax.random.key(0) if key is None else key)
+        episode = jax.tree.map(lambda leaf: leaf[0], recording)
+        draw_episode(path, env, np.asarray(episode.states[: int(episode.episodes.lengths) + 1]))
+        return bool(episode.episodes.terminated)
+
+
+def draw_episode(path: Path, env: RecordableEnvironment, states: np.ndarray) -> None:
+    """Draws an episode from its states (length + 1, S): a GIF of all of them, or a PNG of the last.
+
+    Raises:
+      UserError: for another kind of file.
+    """
+    key = jax.random.key(0)
+    unpacked = [env.vector_to_state(key, jnp.asarray(state)) for state in states]
+    if path.suffix == ".gif":
+        viewer(env).save_gif(env, unpacked, path)
+    elif path.suffix == ".png":
+        viewer(env).save_png(env, unpacked[-1], path)
+    else:
+        raise UserError(f"cannot draw {path.name}: the name must end in .gif or .png")
+
+
+def load_run(path: str | os.PathLike[str], *, summary: dict[str, Any] | None = None) -> Run:
+    """Reads a run's directory.
+
+    Raises:
+      UserError: if it is not the directory of a finished run.
+    """
+    path = Path(path)
+    spec = read_spec(path)
+    file = path / PARAMETERS
+    if not file.exists():
+        raise UserError(f"{path} holds no {PARAMETERS}: the run did not finish; start it again with `hindrl train --config {path / CONFIG}`")
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            tree = unflatten_dict({name: jnp.asarray(archive[name]) for name in archive.files}, sep="/")
+        goals = GoalTable(goals=tree["behavioural_goals"]["goals"], count=tree["behavioural_goals"]["count"])
+        actors = tree["actor"]
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise UserError(f"{file} is damaged ({str(error).splitlines()[0]}): train again") from error
+    if summary is None and (path / SUMMARY).exists():
+        summary = json.loads((path / SUMMARY).read_text())
+    return Run(path=path, spec=spec, summary=summary, actors=actors, behavioural_goals=goals)
+
+
+def _save_parameters(path: Path, result: Result) -> None:
+    agent, goals = result.state.agent, result.guidance.behavioural_goals
+    tree = {
+        "actor": agent.actor,
+        "critics": agent.critics,
+        "log_alpha": agent.log_alpha,
+        "epsilon": result.guidance.epsilon,
+        "behavioural_goals": {"goals": goals.goals, "count": goals.count},
+    }
+    temporary = path.with_suffix(".partial.npz")
+    np.savez(temporary, **{name: np.asarray(leaf) for name, leaf in flatten_dict(tree, sep="/").items()})
+    os.replace(temporary, path)
+
+
+def _write_atomically(path: Path, text: str) -> None:
+    temporary = path.with_suffix(path.suffix + ".partial")
+    temporary.write_text(text)
+    os.replace(temporary, path)

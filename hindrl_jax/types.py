@@ -1,0 +1,116 @@
+"""Data that every part of the project shares: episodes, batches and the interface of an environment.
+
+Shape letters, project-wide: B batch, T time (the horizon), N critics, Q quantiles, G goal, D observation, A action, E environments, S seeds.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+Array = jax.Array
+
+
+@struct.dataclass(kw_only=True)
+class TimeStep:
+    """What one environment step returns.
+
+    `observation` is always the true next observation, also when the episode has just ended: resetting is the caller's business.
+    """
+
+    observation: Array  # (D,) float32
+    reward: Array  # () float32, 1 where the task is solved by this step, else 0
+    terminated: Array  # () bool, the task is over (solved); there is no future value
+    truncated: Array  # () bool, the horizon cut the episode; the future value still exists
+
+
+@struct.dataclass(kw_only=True)
+class Episodes:
+    """A table of episodes, padded to the horizon. Used for demonstrations and, through `replay`, for rollouts.
+
+    Row t of an episode is the transition (observations[t], actions[t], rewards[t], observations[t + 1]) for 0 <= t < length. Entries past the
+    length are padding and are never read. Leading axes other than the first (episode) axis are named where the table is made.
+    """
+
+    observations: Array  # (N, T + 1, D) float32
+    actions: Array  # (N, T, A) float32, in the policy's range [-1, 1]
+    rewards: Array  # (N, T) float32
+    lengths: Array  # (N,) int32, number of transitions, 1 <= length <= T
+    terminated: Array  # (N,) bool, whether the last transition ended the task (rather than the horizon)
+    desired_goals: Array  # (N, G) float32, the goal that the episode was acted under
+
+
+@struct.dataclass(kw_only=True)
+class Transition:
+    """A batch of (n-step) transitions, ready for the losses."""
+
+    observation: Array  # (B, D)
+    action: Array  # (B, A), in [-1, 1]
+    reward: Array  # (B,), sum of the discounted rewards of the n steps
+    discount: Array  # (B,), factor of the bootstrapped value: gamma**steps, or 0 after termination
+    next_observation: Array  # (B, D)
+    desired_goal: Array  # (B, G)
+    is_demonstration: Array  # (B,) bool
+
+
+@runtime_checkable
+class Environment(Protocol):
+    """A goal-conditioned task as pure functions. Implementations are frozen dataclasses: hashable, and static under `jax.jit`.
+
+    `reset` and `step` are unbatched; the caller applies `jax.vmap`. The state is any pytree and carries its own random key.
+    """
+
+    name: str
+    horizon: int  # number of steps after which an episode is truncated
+
+    @property
+    def observation_dim(self) -> int: ...
+
+    @property
+    def goal_dim(self) -> int: ...
+
+    @property
+    def action_dim(self) -> int: ...
+
+    @property
+    def action_low(self) -> float:
+        """Lower bound of every action dimension, in the environment's own units."""
+
+    @property
+    def action_high(self) -> float:
+        """Upper bound of every action dimension, in the environment's own units."""
+
+    def reset(self, key: Array) -> tuple[Any, Array]:
+        """Starts an episode: key -> (state, observation (D,))."""
+
+    def step(self, state: Any, action: Array) -> tuple[Any, TimeStep]:
+        """Takes one step: action (A,) in the environment's own units, clipped to its bounds."""
+
+    def achieved_goal(self, observation: Array) -> Array:
+        """The projection Phi of thesis section 2.2: observations (..., D) -> achieved goals (..., G)."""
+
+    def task_goal(self) -> Array:
+        """(G,) one fixed goal that stands for "the task is solved"."""
+
+
+def action_to_env(action: Array, env: Environment) -> Array:
+    """Maps policy actions in [-1, 1] to the environment's own units, any leading axes."""
+    return env.action_low + (action + 1.0) * (0.5 * (env.action_high - env.action_low))
+
+
+def action_from_env(action: Array, env: Environment) -> Array:
+    """Maps actions in the environment's own units to the policy's [-1, 1]; the inverse of `action_to_env`."""
+    return 2.0 * (action - env.action_low) / (env.action_high - env.action_low) - 1.0
+
+
+def tree_where(condition: Array, if_true: Any, if_false: Any) -> Any:
+    """`jnp.where` over two pytrees of equal structure; `condition` (B,) selects along the leading axis. Typed keys are handled."""
+
+    def select(a: Array, b: Array) -> Array:
+        mask = condition.reshape(condition.shape + (1,) * (a.ndim - condition.ndim))
+        return jnp.where(mask, a, b)
+
+    return jax.tree.map(select, if_true, if_false)

@@ -1,0 +1,113 @@
+"""The arrows between modules: what each may import. Read off the source, so that an import inside a function counts too."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+STANDARD_LIBRARY = {"__future__", "abc", "collections", "dataclasses", "enum", "functools", "itertools", "math", "types", "typing"}
+PURE = STANDARD_LIBRARY | {"jax", "flax", "optax", "chex"}
+
+# Module of the core -> the modules of the core that it may import.
+CORE = {
+    "types": set(),
+    "config": {"types"},
+    "goals": {"types", "config"},
+    "relabel": {"types", "config", "goals"},
+    "replay": {"types", "config", "goals", "relabel"},
+    "networks": {"types", "config"},
+    "losses": {"types"},
+    "agent": {"types", "config", "networks", "losses"},
+    "rollout": {"types", "config", "goals"},
+    "train": {"types", "config", "goals", "relabel", "replay", "networks", "losses", "agent", "rollout"},
+}
+ENVS = sorted(path for path in (ROOT / "envs").rglob("*.py") if path.stem != "viewer")
+VIEWERS = sorted((ROOT / "envs").rglob("viewer.py"))
+EXPERTS = sorted((ROOT / "experts").rglob("*.py"))
+
+
+def imports(path):
+    """Dotted names of everything that a file imports; `from a import b` counts as a.b, since b may be a module."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import; write the full name"
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def not_allowed(path, allowed):
+    """The imports of a file that are neither one of the dotted names in `allowed` nor inside one."""
+    return sorted(name for name in imports(path) if not any(f"{name}.".startswith(f"{prefix}.") for prefix in allowed))
+
+
+def called_names(path):
+    return {node.func.id for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)}
+
+
+def name_of(path):
+    return str(path.relative_to(ROOT))
+
+
+@pytest.mark.parametrize("module", CORE)
+def test_core_module_imports_only_what_comes_before_it(module):
+    path = ROOT / "hindrl_jax" / f"{module}.py"
+    assert not_allowed(path, PURE | {f"hindrl_jax.{used}" for used in CORE[module]}) == []
+    assert called_names(path) & {"print", "open", "input", "__import__", "exec", "eval"} == set()
+
+
+def test_arrows_of_the_core_form_no_circle():
+    """Each module uses only modules that stand before it in the table."""
+    order = list(CORE)
+    assert all(order.index(used) < order.index(module) for module in CORE for used in CORE[module])
+
+
+def test_only_networks_knows_flax_linen():
+    users = {name_of(path) for top in ("hindrl_jax", "envs", "experts") for path in (ROOT / top).rglob("*.py") if uses_linen(path)}
+    assert users == {"hindrl_jax/networks.py"}
+
+
+def uses_linen(path):
+    return any(f"{name}.".startswith("flax.linen.") for name in imports(path))
+
+
+@pytest.mark.parametrize("path", ENVS, ids=name_of)
+def test_env_imports_only_core_types_and_goals(path):
+    # An environment may use its neighbours in envs, but never a viewer.
+    assert not_allowed(path, PURE | {"numpy", "hindrl_jax.types", "hindrl_jax.goals", "envs"}) == []
+    assert not any("viewer" in name.split(".") for name in imports(path))
+
+
+@pytest.mark.parametrize("path", VIEWERS, ids=name_of)
+def test_viewer_may_draw_as_well(path):
+    assert not_allowed(path, PURE | {"numpy", "PIL", "os", "pathlib", "hindrl_jax.types", "hindrl_jax.goals", "envs"}) == []
+
+
+@pytest.mark.parametrize("path", EXPERTS, ids=name_of)
+def test_expert_imports_only_envs_and_core_types(path):
+    assert not_allowed(path, PURE | {"numpy", "hindrl_jax.types", "envs", "experts"}) == []
+
+
+def test_there_is_something_to_check():
+    assert ENVS
+    assert EXPERTS
+
+
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        ("import numpy as np", ["numpy"]),
+        ("from hindrl_jax import train", ["hindrl_jax.train"]),
+        ("from hindrl_jax.train import step", ["hindrl_jax.train.step"]),
+        ("def f():\n    import h5py", ["h5py"]),
+        ("import jaxtyping", ["jaxtyping"]),
+        ("import jax.numpy as jnp\nfrom hindrl_jax.types import Array", []),
+    ],
+)
+def test_forbidden_imports_are_found(tmp_path, source, found):
+    path = tmp_path / "module.py"
+    path.write_text(source)
+    assert not_allowed(path, PURE | {"hindrl_jax.types"}) == found
