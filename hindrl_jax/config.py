@@ -191,6 +191,8 @@ class TrainConfig:
     """Environment steps of the run; for bc, which takes none, gradient steps."""
     num_envs: int = 16
     """Environments stepped side by side."""
+    deterministic_envs: int = 0
+    """How many of them act by the policy's mean action, without exploration; the states where that policy is caught then enter the replay."""
     updates_per_iteration: int = 2
     """Gradient steps after each (vectorised) environment step."""
     learning_starts: int = 1_600

@@ -138,7 +138,7 @@ class RunWriter:
             raise UserError(f"{path} is a file: choose another --out")
         if (path / CONFIG).exists() and not overwrite:
             raise UserError(f"{path} already holds a run: choose another --out, or replace it with --overwrite")
-        self._rows_written = 0
+        self.rows_written = 0
 
     def start(self) -> None:
         """Removes what an earlier run left, then writes the configuration.
@@ -156,18 +156,18 @@ class RunWriter:
 
     def report(self, result: Result) -> None:
         """Appends the evaluations that are new since the last call to `metrics.csv`."""
-        rows = result.rows[self._rows_written :]
+        rows = result.rows[self.rows_written :]
         if not rows:
             return
         fields = [*_ROW_FIELDS, *rows[0].metrics]
         with (self.path / METRICS).open("a", newline="") as file:
             writer = csv.DictWriter(file, fields)
-            if self._rows_written == 0:
+            if self.rows_written == 0:
                 writer.writeheader()
             for row in rows:
                 values = {name: getattr(row, name) for name in _ROW_FIELDS} | row.metrics
                 writer.writerow({name: f"{value:.6g}" if isinstance(value, float) else value for name, value in values.items()})
-        self._rows_written += len(rows)
+        self.rows_written += len(rows)
 
     def finish(self, result: Result) -> dict[str, Any]:
         """Writes the parameters, the summary, the curve and the film of an episode; returns the summary."""

@@ -114,6 +114,18 @@ def make_policy(actor: Any, env: Environment, config: TrainConfig, *, stochastic
     return act
 
 
+def _behaviour(actor: Any, env: Environment, config: TrainConfig) -> Act:
+    """The policy that collects experience: sampled actions, but the mean ones in the first `deterministic_envs` environments."""
+
+    def act(key: Array, observation: Array, desired_goal: Array) -> Array:
+        inputs = agents.policy_input(observation, env.achieved_goal(observation), desired_goal, config.agent)
+        distribution = agents.policy(actor, inputs, config.agent, action_dim=env.action_dim)
+        deterministic = jnp.arange(config.num_envs)[:, None] < config.deterministic_envs
+        return jnp.where(deterministic, distribution.mode, distribution.sample(key)[0])
+
+    return act
+
+
 def _interact(key: Array, state: TrainState, data: Guidance, env: Environment, act: Act) -> TrainState:
     """One step of every environment, stored in the replay."""
     key_act, key_reset = jax.random.split(key)
@@ -166,7 +178,7 @@ def learn(state: TrainState, data: Guidance, *, env: Environment, config: TrainC
 
     def iteration(state: TrainState, _: None) -> tuple[TrainState, Metrics]:
         key, key_interact, key_batch, key_update = jax.random.split(state.key, 4)
-        act = make_policy(state.agent.actor, env, config, stochastic=True)
+        act = _behaviour(state.agent.actor, env, config)
         state = _interact(key_interact, state.replace(key=key), data, env, act)
         draw = functools.partial(
             replay.sample_batch,

@@ -1,0 +1,446 @@
+"""The `hindrl` command. Every failure that is the user's to mend is one line on standard error and exit code 2."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import os
+import re
+import sys
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from experts.recording import RecordableEnvironment
+from hindrl_jax import __version__
+from hindrl_jax.config import TrainConfig
+from hindrl_jax.datasets import describe_demonstrations, load_demonstrations, read_states, save_demonstrations
+from hindrl_jax.errors import UserError
+from hindrl_jax.experiment import Result, record_demonstrations, train
+from hindrl_jax.goals import epsilon_from_demonstrations, goal_table
+from hindrl_jax.presets import Preset, preset
+from hindrl_jax.registry import TASKS, did_you_mean, make, task
+from hindrl_jax.runs import RunSpec, RunWriter, draw_episode, load_run, read_spec
+from hindrl_jax.types import Episodes
+
+_TYRO = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
+console = Console(highlight=False)
+
+
+# ---------------------------------------------------------------------------------------------------------------------------------- train
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainOptions:
+    """Options of `hindrl train` that belong to the run as a whole."""
+
+    demos: str = "1"
+    """Demonstrations: a number to record with the task's expert for each seed, or an HDF5 file that all seeds share."""
+    seeds: int | None = None
+    """Number of seeds trained side by side (default: 1)."""
+    seed: int | None = None
+    """The first seed; the others follow it (default: 0)."""
+    out: Path | None = None
+    """Directory of the run (default: runs/ENV_ALGO_TIME)."""
+    overwrite: bool = False
+    """Replace a run that is already there."""
+
+
+def _train(arguments: list[str]) -> None:
+    """Train policies from demonstrations."""
+    spec, options = _parse_train(arguments)
+    out = options.out or Path("runs") / f"{spec.env.name}_{spec.config.algo}_{time.strftime('%Y%m%d_%H%M%S')}"
+    writer = RunWriter(out, spec, overwrite=options.overwrite)
+    demonstrations = _demonstrations(spec)
+    num_seeds = len(spec.seeds)
+    seeds = f"seed {spec.seeds[0]}" if num_seeds == 1 else f"{num_seeds} seeds from {spec.seeds[0]}"
+    console.print(f"{spec.env.name}, {spec.config.algo}, {_count(demonstrations[0].lengths.shape[0], 'demonstration')}, {seeds}")
+
+    unit = "updates" if spec.config.algo == "bc" else "steps"
+    columns = ("{task.description}", BarColumn(), f"{{task.completed:,.0f}}/{{task.total:,.0f}} {unit}", "{task.fields[rates]}", "left")
+    progress = Progress(*(TextColumn(c) if isinstance(c, str) else c for c in columns), TimeRemainingColumn(), console=console)
+    with progress:
+        bar = progress.add_task("compiling", total=spec.config.steps, rates="")
+
+        def report(result: Result) -> None:
+            if result.steps_done == 0:
+                writer.start()
+                progress.console.print(f"compiled in {result.compile_seconds:.1f} s")
+            new_rows = result.rows[writer.rows_written :]
+            writer.report(result)
+            if new_rows:
+                progress.console.print(_evaluation_line(new_rows))
+            success = result.latest_success()
+            seconds = max(result.train_seconds, 1e-9)
+            rates = f"{num_seeds * result.env_steps / seconds:,.0f} steps/s, {num_seeds * result.updates / seconds:,.0f} updates/s"
+            progress.update(
+                bar,
+                completed=min(result.steps_done, spec.config.steps),
+                description="training" if success is None else f"success {success:4.0%}",
+                rates=rates if result.train_seconds else "",
+            )
+
+        result = train(spec.env, demonstrations, spec.config, seeds=spec.seeds, report=report)
+    summary = writer.finish(result)
+    console.print(_summary_table(summary))
+    console.print(
+        f"{summary['updates_per_second']:,.0f} updates/s and {summary['env_steps_per_second']:,.0f} environment steps/s over all seeds, "
+        f"{summary['train_seconds']:.1f} s of training after {summary['compile_seconds']:.1f} s of compilation, "
+        f"peak memory {summary['peak_memory_bytes'] / 2**20:,.0f} MiB"
+    )
+    console.print(f"wrote {out}: config.json, metrics.csv, summary.json, curve.png, episode.gif, parameters.npz")
+
+
+def _parse_train(arguments: list[str]) -> tuple[RunSpec, TrainOptions]:
+    """Environment, algorithm and preset decide which flags there are and their defaults, so they are read first."""
+    chosen = {name: _peek(arguments, name) for name in ("env", "algo", "preset", "config")}
+    if chosen["config"] is not None:
+        for name in ("env", "algo", "preset"):
+            if chosen[name] is not None:
+                raise UserError(f"--{name} and --config exclude each other: the configuration file says it; drop one of them")
+        spec = read_spec(Path(chosen["config"]))
+    else:
+        config = preset(chosen["algo"] or "hindrl", chosen["preset"] or "default")
+        spec = RunSpec(env=make(chosen["env"] or "FixedGridPickAndPlace"), config=config, demos="1", seeds=(0,))
+
+    environment_class = type(spec.env)
+    fields = [
+        ("env", Literal[tuple(TASKS)], spec.env.name, "The environment; `hindrl envs` lists them."),
+        ("preset", Preset, chosen["preset"] or "default", "Where the other defaults come from: our recipe, the thesis, or its original code."),
+        ("config", Path | None, None, "Run again what a config.json (or the directory of a run) says; other flags change it."),
+        ("options", TrainOptions, TrainOptions(demos=spec.demos), ""),
+        ("training", TrainConfig, spec.config, ""),
+        ("environment", environment_class, spec.env, ""),
+    ]
+    namespace = dataclasses.make_dataclass(
+        "Train",
+        [(name, Annotated[kind, tyro.conf.arg(help=text)] if text else kind, default) for name, kind, default, text in fields],
+        frozen=True,
+    )
+    parsed = _parse(namespace, arguments, "hindrl train", "Train policies from demonstrations.")
+    options = parsed.options
+    seeds = spec.seeds
+    if options.seeds is not None or options.seed is not None:
+        count, first = (1 if options.seeds is None else options.seeds), (seeds[0] if options.seed is None else options.seed)
+        if count < 1:
+            raise UserError(f"--seeds {count} is too few: train at least 1 seed")
+        if not 0 <= first <= 2**32 - count:
+            raise UserError(f"--seed {first} is not usable: choose a whole number from 0 to {2**32 - count}")
+        seeds = tuple(range(first, first + count))
+    return RunSpec(env=parsed.environment, config=parsed.training, demos=options.demos, seeds=seeds), options
+
+
+def _peek(arguments: Sequence[str], name: str) -> str | None:
+    """The value of one flag, before the rest can be understood."""
+    value = None
+    for index, argument in enumerate(arguments):
+        if argument == f"--{name}" and index + 1 < len(arguments):
+            value = arguments[index + 1]
+        elif argument.startswith(f"--{name}="):
+            value = argument.partition("=")[2]
+    return value
+
+
+def _demonstrations(spec: RunSpec) -> list[Episodes]:
+    """One table of demonstrations per seed."""
+    if re.fullmatch(r"[+-]?\d+", spec.demos):
+        return [record_demonstrations(spec.env, int(spec.demos), seed=seed).episodes for seed in spec.seeds]
+    return [load_demonstrations(spec.demos, spec.env)] * len(spec.seeds)
+
+
+def _evaluation_line(rows: Sequence[Any]) -> str:
+    success = [row.success for row in rows]
+    spread = f" (worst seed {min(success):4.0%})" if len(rows) > 1 else ""
+    return (
+        f"{rows[0].env_steps:9,d} steps {rows[0].updates:8,d} updates {rows[0].seconds:7.1f} s   "
+        f"success {np.mean(success):4.0%}{spread}   length {np.mean([row.episode_length for row in rows]):5.1f}"
+    )
+
+
+def _summary_table(summary: dict[str, Any]) -> Table:
+    table = Table("seed", "final", "best", "length", "95% after", "updates", "seconds", title="success over fresh episodes", title_justify="left")
+    for column in table.columns:
+        column.justify = "right"
+    for seed in summary["seeds"]:
+        reached = seed["env_steps_to_95"] is not None
+        table.add_row(
+            str(seed["seed"]),
+            f"{seed['final_success']:.0%}",
+            f"{seed['best_success']:.0%}",
+            f"{seed['episode_length']:.1f}",
+            f"{seed['env_steps_to_95']:,} steps" if reached else "never",
+            f"{seed['updates_to_95']:,}" if reached else "",
+            f"{seed['seconds_to_95']:.1f}" if reached else "",
+        )
+    return table
+
+
+# ------------------------------------------------------------------------------------------------------------------------ eval and render
+
+
+@dataclasses.dataclass(frozen=True)
+class Eval:
+    """Play fresh episodes with the policies of a run."""
+
+    directory: tyro.conf.Positional[Path]
+    """Directory of the run."""
+    episodes: int = 100
+    """Episodes per seed."""
+    seed: int = 0
+    """Which episodes: equal numbers give equal ones."""
+    stochastic: bool = False
+    """Sample the actions instead of taking the mean ones."""
+
+
+def _eval(arguments: list[str]) -> None:
+    """Play fresh episodes with the policies of a run."""
+    options = _parse(Eval, arguments, "hindrl eval")
+    if options.episodes < 1:
+        raise UserError(f"--episodes {options.episodes} is too few: play at least 1")
+    run = load_run(options.directory)
+    outcomes = run.evaluate(episodes=options.episodes, key=_key(options.seed), stochastic=options.stochastic)
+    table = Table("seed", "success", "length", title=f"{run.spec.env.name}, {_count(options.episodes, 'episode')} per seed", title_justify="left")
+    for outcome in outcomes:
+        table.add_row(str(outcome["seed"]), f"{outcome['success']:.1%}", f"{outcome['episode_length']:.1f}")
+    console.print(table)
+
+
+@dataclasses.dataclass(frozen=True)
+class Render:
+    """Film an episode of a run's policy."""
+
+    directory: tyro.conf.Positional[Path]
+    """Directory of the run."""
+    to: Path | None = None
+    """A .gif file, or a .png file for the last state (default: DIRECTORY/episode.gif)."""
+    seed: int | None = None
+    """Whose policy: one of the run's seeds (default: the first)."""
+    episode: int = 0
+    """Which episode: equal numbers give equal ones."""
+    stochastic: bool = False
+    """Sample the actions instead of taking the mean ones."""
+
+
+def _render(arguments: list[str]) -> None:
+    """Film an episode of a run's policy."""
+    options = _parse(Render, arguments, "hindrl render")
+    path = options.to or options.directory / "episode.gif"
+    solved = load_run(options.directory).render(path, seed=options.seed, key=_key(options.episode), stochastic=options.stochastic)
+    console.print(f"wrote {path}: the episode is {'solved' if solved else 'not solved'}")
+
+
+def _key(seed: int) -> jax.Array:
+    if not 0 <= seed < 2**32:
+        raise UserError(f"{seed} cannot name a random episode: choose a whole number from 0 to {2**32 - 1}")
+    return jax.random.key(seed)
+
+
+# ------------------------------------------------------------------------------------------------------------------------- demonstrations
+
+
+@dataclasses.dataclass(frozen=True)
+class Record:
+    """Options of `hindrl demos record`."""
+
+    demos: int
+    """Number of demonstrations; only solved episodes are kept."""
+    out: Path
+    """The HDF5 file to write."""
+    seed: int = 0
+    """Equal seeds give equal demonstrations."""
+    overwrite: bool = False
+    """Replace a file that is already there."""
+
+
+def _demos_record(arguments: list[str]) -> None:
+    """Record demonstrations with the task's expert."""
+    name = _peek(arguments, "env") or "FixedGridPickAndPlace"
+    entry = task(name)
+    namespace = dataclasses.make_dataclass(
+        "Record",
+        [
+            ("options", Record),
+            ("env", Annotated[Literal[tuple(TASKS)], tyro.conf.arg(help="The environment; `hindrl envs` lists them.")], name),
+            ("environment", entry.environment, entry.environment()),
+            ("expert", entry.expert, entry.expert()),
+        ],
+        frozen=True,
+    )
+    parsed = _parse(namespace, arguments, "hindrl demos record", "Record demonstrations with the task's expert.")
+    options, env = parsed.options, parsed.environment
+    _key(options.seed)
+    if options.out.exists() and not options.overwrite:
+        raise UserError(f"{options.out} already exists: choose another --out, or replace it with --overwrite")
+    recording = record_demonstrations(env, options.demos, seed=options.seed, expert=parsed.expert)
+    save_demonstrations(
+        options.out,
+        recording.episodes,
+        states=np.asarray(recording.states),
+        env=env,
+        env_args=dataclasses.asdict(env),
+        expert=dataclasses.asdict(parsed.expert),
+        overwrite=options.overwrite,
+    )
+    lengths = np.asarray(recording.episodes.lengths)
+    console.print(f"wrote {options.out}: {_count(len(lengths), 'demonstration')} of {env.name}, mean length {lengths.mean():.1f} steps")
+
+
+@dataclasses.dataclass(frozen=True)
+class Info:
+    """Say what a file of demonstrations holds."""
+
+    file: tyro.conf.Positional[Path]
+    """The HDF5 file."""
+    m: int = 0
+    """Distance in steps for epsilon (thesis eq. 4.7)."""
+    k: float = 0.0
+    """Weight of the standard deviation in epsilon (thesis eq. 4.7)."""
+
+
+def _demos_info(arguments: list[str]) -> None:
+    """Say what a file of demonstrations holds."""
+    options = _parse(Info, arguments, "hindrl demos info")
+    if options.m < 0 or options.k < 0:
+        raise UserError(f"--m {options.m} --k {options.k} is not usable: both must be 0 or more")
+    summary = describe_demonstrations(options.file)
+    env = make(summary.env_name, **summary.env_kwargs)
+    episodes = load_demonstrations(options.file, env)
+    achieved, lengths = env.achieved_goal(jnp.asarray(episodes.observations)), jnp.asarray(episodes.lengths)
+    epsilon = epsilon_from_demonstrations(achieved, lengths, m=options.m, k=options.k)
+    filtered = goal_table(achieved, lengths, epsilon, filtered=True)
+    console.print(f"{options.file}: {summary.env_name}({', '.join(f'{name}={value}' for name, value in summary.env_kwargs.items())})")
+    console.print(
+        f"{_count(summary.num_demonstrations, 'demonstration')}, {summary.num_solved} solved, {summary.num_transitions} transitions, "
+        f"lengths {summary.length_min} to {summary.length_max}, median {summary.length_median:g}"
+    )
+    console.print(f"the filter keeps {int(filtered.count)} of {int(jnp.sum(lengths + 1))} goals (m = {options.m}, k = {options.k:g})")
+    table = Table("goal dimension", "min", "max", "epsilon")
+    reached = np.concatenate([np.asarray(achieved[i, : int(length) + 1]) for i, length in enumerate(lengths)])
+    for index, row in enumerate(zip(reached.min(axis=0), reached.max(axis=0), epsilon, strict=True)):
+        table.add_row(str(index), *(f"{value:.4g}" for value in row))
+    console.print(table)
+
+
+@dataclasses.dataclass(frozen=True)
+class RenderDemo:
+    """Film a demonstration."""
+
+    file: tyro.conf.Positional[Path]
+    """The HDF5 file."""
+    to: Path | None = None
+    """A .gif file, or a .png file for the last state (default: the file's name with .gif)."""
+    demo: int = 0
+    """Which demonstration, counted from 0."""
+
+
+def _demos_render(arguments: list[str]) -> None:
+    """Film a demonstration."""
+    options = _parse(RenderDemo, arguments, "hindrl demos render")
+    summary = describe_demonstrations(options.file)
+    states = read_states(options.file)
+    if not 0 <= options.demo < len(states):
+        raise UserError(f"{options.file} has no demonstration {options.demo}: choose one from 0 to {len(states) - 1}")
+    path = options.to or options.file.with_suffix(".gif")
+    draw_episode(path, make(summary.env_name, **summary.env_kwargs), states[options.demo])
+    console.print(f"wrote {path}: {len(states[options.demo]) - 1} steps")
+
+
+def _envs(arguments: list[str]) -> None:
+    """List the environments."""
+    _parse(dataclasses.make_dataclass("Envs", []), arguments, "hindrl envs", "List the environments with their dimensions.")
+    table = Table("environment", "observation", "goal", "action", "horizon", "arguments", "task")
+    for entry in TASKS.values():
+        env: RecordableEnvironment = entry.environment()
+        arguments_text = ", ".join(f"{field.name}={getattr(env, field.name)}" for field in dataclasses.fields(env))
+        table.add_row(env.name, *map(str, (env.observation_dim, env.goal_dim, env.action_dim, env.horizon)), arguments_text, entry.summary)
+    console.print(table)
+
+
+# ------------------------------------------------------------------------------------------------------------------------------- plumbing
+
+Command = Callable[[list[str]], None]
+COMMANDS: dict[str, Command | dict[str, Command]] = {
+    "train": _train,
+    "eval": _eval,
+    "render": _render,
+    "demos": {"record": _demos_record, "info": _demos_info, "render": _demos_render},
+    "envs": _envs,
+}
+
+
+def _parse(arguments_class: type[Any], arguments: list[str], program: str, description: str | None = None) -> Any:
+    """tyro, with its page of explanation on a mistake cut down to one line."""
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            return tyro.cli(arguments_class, args=arguments, prog=program, description=description, config=_TYRO)
+    except SystemExit as stop:
+        if stop.code in (0, None):
+            raise
+        raise UserError(_first_sentence(complaint.getvalue()) + f" (see {program} --help)") from None
+
+
+def _first_sentence(box: str) -> str:
+    """The message in tyro's box: the lines before the first rule, and the flag it suggests, if any."""
+    lines = [line.strip("│ ").strip() for line in box.splitlines() if line.startswith("│")]
+    rule = next((index for index, line in enumerate(lines) if set(line) <= {"─"}), len(lines))
+    message = re.sub(r"^Error parsing \S*(training|environment|options|expert)\S*: ", "", " ".join(lines[:rule]))
+    suggestion = next((line.split()[0] for line in lines[rule:] if line.startswith("--")), None)
+    return f"{message} (did you mean {suggestion}?)" if suggestion and message.startswith("Unrecognized") else message
+
+
+def _usage() -> str:
+    lines = [f"hindrl {__version__}: learn sparse-reward tasks from a handful of demonstrations", ""]
+    for name, command in COMMANDS.items():
+        for words, function in [(name, command)] if callable(command) else [(f"{name} {sub}", f) for sub, f in command.items()]:
+            lines.append(f"  hindrl {words:<14}{function.__doc__}")
+    return "\n".join([*lines, "", "Each takes --help."])
+
+
+def _find(arguments: list[str]) -> tuple[Command, list[str]]:
+    commands: Any = COMMANDS
+    words = "hindrl"
+    while isinstance(commands, dict):
+        if not arguments or arguments[0] not in commands:
+            given = (
+                f"{arguments[0]!r} is not a command of {words!r}{did_you_mean(arguments[0], commands)}" if arguments else f"{words!r} needs a command"
+            )
+            raise UserError(f"{given}: choose one of {', '.join(commands)}")
+        words, commands, arguments = f"{words} {arguments[0]}", commands[arguments[0]], arguments[1:]
+    return commands, arguments
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point of the `hindrl` command."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments in (["--help"], ["-h"], ["demos", "--help"], ["demos", "-h"]):
+        print(_usage())
+        return
+    warnings.showwarning = lambda message, *_, **__: print(f"hindrl: warning: {message}", file=sys.stderr)
+    try:
+        command, rest = _find(arguments)
+        command(rest)
+    except UserError as error:
+        print(f"hindrl: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("hindrl: interrupted", file=sys.stderr)
+        sys.exit(130)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
