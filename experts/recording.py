@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from hindrl_jax.errors import UserError
 from hindrl_jax.types import Array, Environment, Episodes, action_from_env, tree_where
 
 Expert = Any
@@ -44,20 +45,21 @@ def play(key: Array, env: RecordableEnvironment, act: Callable[[Array, Any, Arra
       num_episodes: N, played side by side.
     """
 
-    def step(carry: tuple[Any, Array, Array], key: Array) -> tuple[tuple[Any, Array, Array], tuple[Array, ...]]:
-        state, observation, over = carry
-        action = act(key, state, observation)
+    def step(carry: tuple[Array, Any, Array, Array], _: None) -> tuple[tuple[Array, Any, Array, Array], tuple[Array, ...]]:
+        key, state, observation, over = carry
+        key, key_act = jax.random.split(key)
+        action = act(key_act, state, observation)
         next_state, time_step = env.step(state, action)
         next_state = tree_where(over, state, next_state)
         next_observation = jnp.where(over, observation, time_step.observation)
         row = (observation, env.state_to_vector(state), action_from_env(action, env), time_step.reward, over, time_step.terminated)
-        return (next_state, next_observation, over | time_step.terminated | time_step.truncated), row
+        return (key, next_state, next_observation, over | time_step.terminated | time_step.truncated), row
 
     def episode(key: Array) -> Recording:
         key_reset, key_play = jax.random.split(key)
         state, observation = env.reset(key_reset)
-        start = (state, observation, jnp.asarray(False))
-        (state, observation, _), rows = jax.lax.scan(step, start, jax.random.split(key_play, env.horizon))
+        start = (key_play, state, observation, jnp.asarray(False))
+        (_, state, observation, _), rows = jax.lax.scan(step, start, length=env.horizon)
         observations, states, actions, rewards, over, terminated = rows
         return Recording(
             episodes=Episodes(
@@ -89,17 +91,17 @@ def record(key: Array, env: RecordableEnvironment, expert: Expert, num_demos: in
       max_attempts: episodes to play before giving up; by default 100 times `num_demos`.
 
     Raises:
-      ValueError: if `num_demos` is below 1, or the expert solves too few episodes.
+      UserError: if `num_demos` is below 1, or the expert solves too few episodes.
     """
     if num_demos < 1:
-        raise ValueError(f"num_demos = {num_demos} is too few: record at least 1 demonstration")
+        raise UserError(f"num_demos = {num_demos} is too few: record at least 1 demonstration")
     max_attempts = 100 * num_demos if max_attempts is None else max_attempts
     batch_size = max(num_demos, 16)
     kept, attempts = [], 0
     while sum(len(batch.states) for batch in kept) < num_demos:
         if attempts >= max_attempts:
             found = sum(len(batch.states) for batch in kept)
-            raise ValueError(
+            raise UserError(
                 f"the expert solved only {found} of {attempts} episodes of {env.name} within the horizon of {env.horizon} steps, "
                 f"but {num_demos} demonstrations are wanted: raise the horizon or ask for fewer"
             )

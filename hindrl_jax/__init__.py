@@ -4,7 +4,7 @@
 
     env = hindrl.make("FixedGridPickAndPlace")
     demonstrations = hindrl.record_demonstrations(env, num_demos=1).episodes
-    result = hindrl.train(env, demonstrations, hindrl.preset("hindrl"), seeds=[0])
+    result = hindrl.fit(env, demonstrations, hindrl.preset("hindrl"), seeds=[0])
     print(result.final_success)
 
 The algorithm is in `goals`, `relabel`, `replay`, `networks`, `losses`, `agent`, `rollout` and `train`: pure functions that know no task by name.
@@ -21,6 +21,7 @@ __version__ = "0.1.0"
 _EXPORTS = {
     "Result": "hindrl_jax.experiment",
     "UserError": "hindrl_jax.errors",
+    "fit": "hindrl_jax.experiment",
     "load_demonstrations": "hindrl_jax.datasets",
     "load_run": "hindrl_jax.runs",
     "make": "hindrl_jax.registry",
@@ -28,7 +29,6 @@ _EXPORTS = {
     "record_demonstrations": "hindrl_jax.experiment",
     "save_demonstrations": "hindrl_jax.datasets",
     "save_run": "hindrl_jax.runs",
-    "train": "hindrl_jax.experiment",
 }
 
 __all__ = ["__version__", *_EXPORTS]

@@ -27,6 +27,7 @@ class AgentState:
     """Everything the agent learns."""
 
     actor: Params
+    average_actor: Params  # running average of the actor, which acts more steadily
     critics: Params  # leaves (N, ...)
     target_critics: Params  # leaves (N, ...)
     log_alpha: Array  # ()
@@ -39,8 +40,48 @@ def _optimiser(config: AgentConfig) -> optax.GradientTransformation:
     return optax.adam(config.learning_rate)
 
 
-def policy_input(observation: Array, achieved_goal: Array, desired_goal: Array, config: AgentConfig) -> Array:
-    """Joins what the networks see, along the last axis: (B, D), (B, G), (B, G) -> (B, input_dim)."""
+@struct.dataclass(kw_only=True)
+class InputScale:
+    """Typical size of each input dimension, by which the multiscale encoding divides."""
+
+    observation: Array  # (D,) > 0
+    goal: Array  # (G,) > 0
+
+
+def input_scale(observations: Array, achieved_goals: Array, weights: Array) -> InputScale:
+    """Root mean square of each dimension over demonstration states; 1 where a dimension is always zero.
+
+    Args:
+      observations, achieved_goals: (..., D) and (..., G).
+      weights: (...) 1 for states that count, 0 for padding.
+    """
+
+    def rms(values: Array) -> Array:
+        axes = tuple(range(values.ndim - 1))
+        mean_square = jnp.sum(jnp.square(values) * weights[..., None], axis=axes) / jnp.sum(weights)
+        return jnp.where(mean_square > 0.0, jnp.sqrt(mean_square), 1.0)
+
+    return InputScale(observation=rms(observations), goal=rms(achieved_goals))
+
+
+def _encode(values: Array, scale: Array, config: AgentConfig) -> Array:
+    if config.input_encoding == "raw":
+        return values
+    scaled = values / scale.reshape((1,) * (values.ndim - 1) + scale.shape)
+    return jnp.concatenate([scaled, jnp.tanh(4.0 * scaled)], axis=-1)
+
+
+def network_inputs(observation: Array, achieved_goal: Array, desired_goal: Array, scale: InputScale, config: AgentConfig) -> Array:
+    """Joins what the networks see, along the last axis: (..., D), (..., G), (..., G) -> (..., input_dim).
+
+    The multiscale encoding gives each dimension twice: once linear, for distances, once saturating, so that "exactly there" and "one
+    step off" are far apart. With inputs as they are, small networks blur the two.
+    """
+    observation, achieved_goal, desired_goal = (
+        _encode(observation, scale.observation, config),
+        _encode(achieved_goal, scale.goal, config),
+        _encode(desired_goal, scale.goal, config),
+    )
     if config.policy_input == "observation_goal":
         return jnp.concatenate([observation, desired_goal], axis=-1)
     return jnp.concatenate([achieved_goal, desired_goal, observation], axis=-1)
@@ -49,14 +90,15 @@ def policy_input(observation: Array, achieved_goal: Array, desired_goal: Array, 
 def init(key: Array, config: AgentConfig, *, observation_dim: int, goal_dim: int, action_dim: int) -> AgentState:
     """A fresh agent; the target critics start as a copy of the critics."""
     key_actor, key_critics = jax.random.split(key)
-    sizes = (jnp.zeros((1, observation_dim)), jnp.zeros((1, goal_dim)), jnp.zeros((1, goal_dim)))
-    input_dim = policy_input(*sizes, config).shape[-1]
+    unit = InputScale(observation=jnp.ones(observation_dim), goal=jnp.ones(goal_dim))
+    input_dim = network_inputs(unit.observation, unit.goal, unit.goal, unit, config).shape[-1]
     actor = init_actor(key_actor, config, input_dim=input_dim, action_dim=action_dim)
     critics = init_critics(key_critics, config, input_dim=input_dim, action_dim=action_dim)
     log_alpha = jnp.log(jnp.asarray(config.initial_alpha, jnp.float32))
     optimiser = _optimiser(config)
     return AgentState(
         actor=actor,
+        average_actor=jax.tree.map(jnp.copy, actor),
         critics=critics,
         target_critics=jax.tree.map(jnp.copy, critics),
         log_alpha=log_alpha,
@@ -67,8 +109,15 @@ def init(key: Array, config: AgentConfig, *, observation_dim: int, goal_dim: int
 
 
 def policy(actor: Params, inputs: Array, config: AgentConfig, *, action_dim: int) -> ActionDistribution:
-    """The distribution over actions at inputs (B, input_dim), see `policy_input`."""
+    """The distribution over actions at inputs (B, input_dim), see `network_inputs`."""
     return apply_actor(actor, inputs, config, action_dim=action_dim)
+
+
+def target_entropy(progress: Array | float, config: AgentConfig, *, action_dim: int) -> Array | float:
+    """The entropy aimed at, in nats, when a share `progress` in [0, 1] of the run is over."""
+    start = -float(action_dim) if config.target_entropy is None else config.target_entropy
+    end = start if config.final_target_entropy is None else config.final_target_entropy
+    return start + (end - start) * progress
 
 
 def _descend(gradient: Any, optimiser_state: optax.OptState, params: Any, config: AgentConfig) -> tuple[Any, optax.OptState]:
@@ -76,7 +125,9 @@ def _descend(gradient: Any, optimiser_state: optax.OptState, params: Any, config
     return optax.apply_updates(params, updates), optimiser_state
 
 
-def update(key: Array, state: AgentState, batch: Transition, *, inputs: Array, next_inputs: Array, config: AgentConfig) -> tuple[AgentState, Metrics]:
+def update(
+    key: Array, state: AgentState, batch: Transition, *, inputs: Array, next_inputs: Array, target_entropy: Array | float, config: AgentConfig
+) -> tuple[AgentState, Metrics]:
     """One gradient step of entropy coefficient, critics and actor, then of the target critics.
 
     Critic: quantile Huber loss towards the truncated atoms of r + discount (Z' - alpha log pi(a' | s')).
@@ -86,7 +137,8 @@ def update(key: Array, state: AgentState, batch: Transition, *, inputs: Array, n
       key: random key.
       state: the agent.
       batch: B transitions.
-      inputs, next_inputs: (B, input_dim) network inputs at the two ends of the transitions, see `policy_input`.
+      inputs, next_inputs: (B, input_dim) network inputs at the two ends of the transitions, see `network_inputs`.
+      target_entropy: () see `target_entropy`.
       config: static.
 
     Returns:
@@ -94,7 +146,6 @@ def update(key: Array, state: AgentState, batch: Transition, *, inputs: Array, n
     """
     key_actor, key_next = jax.random.split(key)
     action_dim = batch.action.shape[-1]
-    target_entropy = -float(action_dim) if config.target_entropy is None else config.target_entropy
     alpha = jnp.exp(state.log_alpha)
 
     next_action, next_log_prob = policy(state.actor, next_inputs, config, action_dim=action_dim).sample(key_next)
@@ -130,6 +181,7 @@ def update(key: Array, state: AgentState, batch: Transition, *, inputs: Array, n
 
     new_state = AgentState(
         actor=actor,
+        average_actor=optax.incremental_update(actor, state.average_actor, config.actor_average_rate),
         critics=critics,
         target_critics=optax.incremental_update(critics, state.target_critics, config.target_update_rate),
         log_alpha=log_alpha,
@@ -171,4 +223,5 @@ def update_bc(state: AgentState, batch: Transition, *, inputs: Array, config: Ag
 
     value, gradient = jax.value_and_grad(loss)(state.actor)
     actor, actor_optimiser = _descend(gradient, state.actor_optimiser, state.actor, config)
-    return state.replace(actor=actor, actor_optimiser=actor_optimiser), {"actor/bc_loss": value}
+    average_actor = optax.incremental_update(actor, state.average_actor, config.actor_average_rate)
+    return state.replace(actor=actor, average_actor=average_actor, actor_optimiser=actor_optimiser), {"actor/bc_loss": value}

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
+from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
@@ -27,7 +28,7 @@ from hindrl_jax import __version__
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.datasets import describe_demonstrations, load_demonstrations, read_states, save_demonstrations
 from hindrl_jax.errors import UserError
-from hindrl_jax.experiment import Result, record_demonstrations, train
+from hindrl_jax.experiment import Result, fit, record_demonstrations
 from hindrl_jax.goals import epsilon_from_demonstrations, goal_table
 from hindrl_jax.presets import Preset, preset
 from hindrl_jax.registry import TASKS, did_you_mean, make, task
@@ -35,7 +36,7 @@ from hindrl_jax.runs import RunSpec, RunWriter, draw_episode, load_run, read_spe
 from hindrl_jax.types import Episodes
 
 _TYRO = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
-console = Console(highlight=False)
+console = Console(highlight=False, soft_wrap=True)
 
 
 # ---------------------------------------------------------------------------------------------------------------------------------- train
@@ -91,7 +92,7 @@ def _train(arguments: list[str]) -> None:
                 rates=rates if result.train_seconds else "",
             )
 
-        result = train(spec.env, demonstrations, spec.config, seeds=spec.seeds, report=report)
+        result = fit(spec.env, demonstrations, spec.config, seeds=spec.seeds, report=report)
     summary = writer.finish(result)
     console.print(_summary_table(summary))
     console.print(
@@ -169,7 +170,7 @@ def _evaluation_line(rows: Sequence[Any]) -> str:
 
 
 def _summary_table(summary: dict[str, Any]) -> Table:
-    table = Table("seed", "final", "best", "length", "95% after", "updates", "seconds", title="success over fresh episodes", title_justify="left")
+    table = Table("seed", "final", "best", "length", "95% after", "updates", "seconds", box=box.SIMPLE_HEAD)
     for column in table.columns:
         column.justify = "right"
     for seed in summary["seeds"]:
@@ -210,7 +211,8 @@ def _eval(arguments: list[str]) -> None:
         raise UserError(f"--episodes {options.episodes} is too few: play at least 1")
     run = load_run(options.directory)
     outcomes = run.evaluate(episodes=options.episodes, key=_key(options.seed), stochastic=options.stochastic)
-    table = Table("seed", "success", "length", title=f"{run.spec.env.name}, {_count(options.episodes, 'episode')} per seed", title_justify="left")
+    table = Table("seed", "success", "length", box=box.SIMPLE_HEAD)
+    console.print(f"{run.spec.env.name}, {_count(options.episodes, 'episode')} per seed")
     for outcome in outcomes:
         table.add_row(str(outcome["seed"]), f"{outcome['success']:.1%}", f"{outcome['episode_length']:.1f}")
     console.print(table)
@@ -325,7 +327,7 @@ def _demos_info(arguments: list[str]) -> None:
         f"lengths {summary.length_min} to {summary.length_max}, median {summary.length_median:g}"
     )
     console.print(f"the filter keeps {int(filtered.count)} of {int(jnp.sum(lengths + 1))} goals (m = {options.m}, k = {options.k:g})")
-    table = Table("goal dimension", "min", "max", "epsilon")
+    table = Table("goal dimension", "min", "max", "epsilon", box=box.SIMPLE_HEAD)
     reached = np.concatenate([np.asarray(achieved[i, : int(length) + 1]) for i, length in enumerate(lengths)])
     for index, row in enumerate(zip(reached.min(axis=0), reached.max(axis=0), epsilon, strict=True)):
         table.add_row(str(index), *(f"{value:.4g}" for value in row))
@@ -359,12 +361,15 @@ def _demos_render(arguments: list[str]) -> None:
 def _envs(arguments: list[str]) -> None:
     """List the environments."""
     _parse(dataclasses.make_dataclass("Envs", []), arguments, "hindrl envs", "List the environments with their dimensions.")
-    table = Table("environment", "observation", "goal", "action", "horizon", "arguments", "task")
+    table = Table("environment", "observation", "goal", "action", "horizon", box=box.SIMPLE_HEAD)
     for entry in TASKS.values():
         env: RecordableEnvironment = entry.environment()
-        arguments_text = ", ".join(f"{field.name}={getattr(env, field.name)}" for field in dataclasses.fields(env))
-        table.add_row(env.name, *map(str, (env.observation_dim, env.goal_dim, env.action_dim, env.horizon)), arguments_text, entry.summary)
+        table.add_row(env.name, *map(str, (env.observation_dim, env.goal_dim, env.action_dim, env.horizon)))
     console.print(table)
+    for entry in TASKS.values():
+        console.print(f"{entry.environment.name}: {entry.summary}")
+        for field in dataclasses.fields(entry.environment):
+            console.print(f"  --{field.name.replace('_', '-')} (default {field.default})")
 
 
 # ------------------------------------------------------------------------------------------------------------------------------- plumbing
@@ -391,9 +396,9 @@ def _parse(arguments_class: type[Any], arguments: list[str], program: str, descr
         raise UserError(_first_sentence(complaint.getvalue()) + f" (see {program} --help)") from None
 
 
-def _first_sentence(box: str) -> str:
+def _first_sentence(complaint: str) -> str:
     """The message in tyro's box: the lines before the first rule, and the flag it suggests, if any."""
-    lines = [line.strip("│ ").strip() for line in box.splitlines() if line.startswith("│")]
+    lines = [line.strip("│ ").strip() for line in complaint.splitlines() if line.startswith("│")]
     rule = next((index for index, line in enumerate(lines) if set(line) <= {"─"}), len(lines))
     message = re.sub(r"^Error parsing \S*(training|environment|options|expert)\S*: ", "", " ".join(lines[:rule]))
     suggestion = next((line.split()[0] for line in lines[rule:] if line.startswith("--")), None)

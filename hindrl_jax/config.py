@@ -59,13 +59,13 @@ def _in_words(hint: Any) -> str:
 class BatchConfig:
     """How a training batch is put together (thesis section 4.1.2)."""
 
-    batch_size: int = 512
+    batch_size: int = 256
     """Rows of the batch of a gradient step, demonstrations included."""
     max_demo_ratio: float = 0.25
     """Share of demonstration rows in the batch at the start of training (MAX_d of thesis eq. 4.9, as a ratio)."""
     reach_zero: int | None = None
     """Environment step at which the demonstration share has fallen linearly to zero (thesis eq. 4.9); None keeps it constant."""
-    num_sampled_goals: int = 4
+    num_sampled_goals: float = 0.25
     """Relabelled rows per original replay row, n: the relabelled share of the replay rows is n / (n + 1). Zero turns relabelling off."""
     hindrl_sampling_strategy: Strategy = "task_conditioned"
     """Where relabelled goals come from; rollout_conditioned is the thesis's name for future."""
@@ -150,16 +150,22 @@ class AgentConfig:
     """Largest target quantiles dropped per critic (TQC's truncation)."""
     target_update_rate: float = 0.02
     """Share of the online critics that moves into the target critics at each gradient step (Polyak averaging)."""
-    initial_alpha: float = 1.0
+    actor_average_rate: float = 0.005
+    """Share of the actor that moves into its running average at each gradient step; evaluations and the saved policy use the average."""
+    initial_alpha: float = 0.002
     """Entropy coefficient at the start; it is tuned automatically from there."""
-    target_entropy: float | None = None
-    """Entropy that the automatic tuning aims at; None means minus the number of action dimensions."""
-    bc_weight: float = 0.1
+    target_entropy: float | None = -1.0
+    """Entropy that the automatic tuning aims at, in nats; None means minus the number of action dimensions."""
+    final_target_entropy: float | None = -10.0
+    """Where the target entropy has moved, linearly, by the end of the run; None keeps it constant."""
+    bc_weight: float = 0.01
     """Weight of the behaviour cloning loss on demonstration rows (lambda_BC of the thesis)."""
     bc_loss: Literal["squared", "norm"] = "squared"
     """Squared distance to the demonstrated action (thesis), or its square root per row (original code)."""
     bc_action: Literal["mean", "sample"] = "mean"
     """Compare the policy's mean action (thesis) or a sampled one (original code) with the demonstrated action."""
+    input_encoding: Literal["raw", "multiscale"] = "multiscale"
+    """Networks see inputs as they are (thesis), or x and tanh(4 x), x being the input over its root mean square in the demonstrations."""
     policy_input: Literal["observation_goal", "achieved_desired_observation"] = "observation_goal"
     """What the networks see; the second form repeats the achieved goal, as the thesis's framework does."""
 
@@ -176,6 +182,7 @@ class AgentConfig:
                 f"between 0 and num_quantiles - 1 = {self.num_quantiles - 1}",
             ),
             target_update_rate=(0.0 < self.target_update_rate <= 1.0, "in (0, 1]"),
+            actor_average_rate=(0.0 < self.actor_average_rate <= 1.0, "in (0, 1]; 1 means no averaging"),
             initial_alpha=(self.initial_alpha > 0.0, "greater than 0"),
             bc_weight=(self.bc_weight >= 0.0, "0 or more"),
         )
@@ -187,19 +194,17 @@ class TrainConfig:
 
     algo: Algorithm = "hindrl"
     """Which of the four models: bc, tqcfd (no relabelling), hindrl, smooth-hindrl."""
-    steps: int = 300_000
+    steps: int = 400_000
     """Environment steps of the run; for bc, which takes none, gradient steps."""
-    num_envs: int = 16
+    num_envs: int = 64
     """Environments stepped side by side."""
-    deterministic_envs: int = 0
-    """How many of them act by the policy's mean action, without exploration; the states where that policy is caught then enter the replay."""
     updates_per_iteration: int = 2
     """Gradient steps after each (vectorised) environment step."""
-    learning_starts: int = 1_600
+    learning_starts: int = 6_400
     """Environment steps with uniformly random actions before the first gradient step."""
     buffer_size: int = 500_000
     """Transitions that the replay holds."""
-    eval_every: int = 8_000
+    eval_every: int = 16_000
     """Environment steps (bc: gradient steps) between evaluations."""
     eval_episodes: int = 100
     """Episodes of each evaluation, with the policy's mean action."""
@@ -215,5 +220,9 @@ class TrainConfig:
             **{name: (getattr(self, name) >= 1, "at least 1") for name in counts},
             learning_starts=(self.learning_starts >= 0, "0 or more"),
         )
+        if self.algo == "tqcfd" and self.batch.num_sampled_goals > 0:
+            raise ValueError(f"tqcfd does not relabel, but num_sampled_goals = {self.batch.num_sampled_goals}: set it to 0, or choose hindrl")
+        if self.algo == "smooth-hindrl" and not self.goal.epsilon_filtering:
+            raise ValueError("smooth-hindrl is hindrl with epsilon_filtering, which is off: turn it on, or choose hindrl")
         if self.algo != "bc" and self.steps <= self.learning_starts:
             raise ValueError(f"steps = {self.steps} ends before learning begins: it must be greater than learning_starts = {self.learning_starts}")

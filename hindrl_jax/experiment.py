@@ -15,7 +15,7 @@ import numpy as np
 from experts.recording import RecordableEnvironment, Recording, record
 from hindrl_jax import train as training
 from hindrl_jax.config import TrainConfig
-from hindrl_jax.registry import checked, task
+from hindrl_jax.registry import task
 from hindrl_jax.train import Guidance, TrainState
 from hindrl_jax.types import Episodes
 
@@ -64,7 +64,7 @@ class Result:
     guidance: Guidance
     """Leaves (S, ...)."""
     state: TrainState
-    """Leaves (S, ...); the policies' parameters are `state.agent.actor`. While the run is under way the next chunk consumes it."""
+    """Leaves (S, ...); the policies' parameters are `state.agent.average_actor`. While the run is under way the next chunk consumes it."""
     rows: list[Row]
     """One row per evaluation and seed, in order of time."""
     compile_seconds: float
@@ -123,10 +123,10 @@ def record_demonstrations(env: RecordableEnvironment, num_demos: int, *, seed: i
       UserError: if `num_demos` is below 1 or the expert cannot solve the task within its horizon.
     """
     expert = task(env.name).expert() if expert is None else expert
-    return checked(lambda: record(jax.random.fold_in(jax.random.key(seed), 1), env, expert, num_demos))
+    return record(jax.random.fold_in(jax.random.key(seed), 1), env, expert, num_demos)
 
 
-def train(
+def fit(
     env: RecordableEnvironment,
     demonstrations: Episodes | Sequence[Episodes],
     config: TrainConfig,
@@ -182,7 +182,7 @@ def train(
         result.steps_done = result.updates if config.algo == "bc" else result.env_steps
         if result.steps_done >= min(next_evaluation, config.steps):
             key_eval, key_now = _split_all(key_eval)
-            evaluation = jax.device_get(programs.evaluate(key_now, result.state.agent.actor, guidance))
+            evaluation = jax.device_get(programs.evaluate(key_now, result.state.agent.average_actor, guidance))
             result.train_seconds = time.perf_counter() - started
             averaged = {name: np.mean([chunk[name] for chunk in chunks_metrics], axis=0) for name in chunks_metrics[0]}
             result.rows += _rows(result, evaluation, averaged)
@@ -191,7 +191,7 @@ def train(
         result.train_seconds = time.perf_counter() - started
         report(result)
 
-    fresh = jax.device_get(programs.evaluate_fresh(key_eval, result.state.agent.actor, guidance))
+    fresh = jax.device_get(programs.evaluate_fresh(key_eval, result.state.agent.average_actor, guidance))
     result.final_success, result.final_length = fresh.success.mean(axis=1), fresh.length.mean(axis=1)
     report(result)
     return result
@@ -203,7 +203,7 @@ class _Programs:
     def __init__(self, env: RecordableEnvironment, config: TrainConfig, demonstrations: Episodes, key_init: jax.Array):
         static = dict(env=env, config=config)
         self.guidance = jax.jit(jax.vmap(functools.partial(training.guidance, **static)))(demonstrations)
-        self.state = checked(lambda: jax.jit(jax.vmap(functools.partial(training.init, **static)))(key_init, self.guidance))
+        self.state = jax.jit(jax.vmap(functools.partial(training.init, **static)))(key_init, self.guidance)
 
         per_step = 1 if config.algo == "bc" else config.num_envs
         iterations = max(1, config.eval_every // per_step // CHUNKS_PER_EVALUATION)
@@ -216,7 +216,7 @@ class _Programs:
         def evaluation(num_episodes: int) -> Any:
             program = functools.partial(training.evaluate, num_episodes=num_episodes, **static)
             mapped = jax.jit(jax.vmap(program))
-            return mapped.lower(key_init, self.state.agent.actor, self.guidance).compile()
+            return mapped.lower(key_init, self.state.agent.average_actor, self.guidance).compile()
 
         self.evaluate = evaluation(config.eval_episodes)
         self.evaluate_fresh = self.evaluate if config.eval_episodes == FRESH_EPISODES else evaluation(FRESH_EPISODES)

@@ -98,6 +98,11 @@ class GoalTable:
     count: Array  # () int32, 1 <= count <= M
 
 
+def is_visited(lengths: Array, num_states: int) -> Array:
+    """Marks the states that are not padding: lengths (N,) -> (N, num_states) bool; an episode of length l visits l + 1 states."""
+    return jnp.arange(num_states)[None] <= lengths[:, None]
+
+
 def goal_table(
     achieved_goals: Array, lengths: Array, epsilon: Array, *, filtered: bool, exclude_last: bool = False, inclusive: bool = True
 ) -> GoalTable:
@@ -114,8 +119,7 @@ def goal_table(
     Returns:
       A table with M = N * (T + 1) rows, of which `count` are goals.
     """
-    steps = jnp.arange(achieved_goals.shape[1])[None]
-    keep = steps <= lengths[:, None] - int(exclude_last)
+    keep = is_visited(lengths - int(exclude_last), achieved_goals.shape[1])
     if filtered:
         keep &= jax.vmap(lambda goals: epsilon_filter(goals, epsilon, inclusive=inclusive))(achieved_goals)
     keep = keep.reshape(-1)

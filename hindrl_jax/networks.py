@@ -13,6 +13,7 @@ from hindrl_jax.config import AgentConfig
 from hindrl_jax.types import Array
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
+_KERNEL_INIT = nn.initializers.variance_scaling(1.0 / 3.0, "fan_in", "uniform")  # U(-b, b), b = 1 / sqrt(fan_in), as in the thesis's framework
 
 Params = Any
 
@@ -28,11 +29,11 @@ class MLP(nn.Module):
     def __call__(self, inputs: Array) -> Array:
         hidden = inputs
         for width in self.net_arch:
-            hidden = nn.Dense(width)(hidden)
+            hidden = nn.Dense(width, kernel_init=_KERNEL_INIT)(hidden)
             if self.layer_norm:
                 hidden = nn.LayerNorm()(hidden)
             hidden = nn.relu(hidden)
-        return nn.Dense(self.out_dim)(hidden)
+        return nn.Dense(self.out_dim, kernel_init=_KERNEL_INIT)(hidden)
 
 
 @struct.dataclass(kw_only=True)

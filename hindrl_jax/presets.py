@@ -37,7 +37,7 @@ def _as_algorithm(config: TrainConfig, algo: Algorithm) -> TrainConfig:
     """TQCfD is HinDRL without relabelling, Smooth HinDRL is HinDRL with the filter (thesis sections 4.1.3 and 4.1.4)."""
     batch, goal = config.batch, config.goal
     if algo == "tqcfd":
-        batch = dataclasses.replace(batch, num_sampled_goals=0)
+        batch = dataclasses.replace(batch, num_sampled_goals=0.0)
     if algo == "smooth-hindrl":
         goal = dataclasses.replace(goal, epsilon_filtering=True)
     return dataclasses.replace(config, algo=algo, batch=batch, goal=goal)
@@ -63,7 +63,9 @@ def _thesis(algo: Algorithm) -> TrainConfig:
             steps=20_000,
             eval_every=1_000,
             batch=BatchConfig(batch_size=2_048, n_step=1),
-            agent=AgentConfig(net_arch=(32, 32), learning_rate=1e-3, policy_input="achieved_desired_observation"),
+            agent=AgentConfig(
+                net_arch=(32, 32), learning_rate=1e-3, input_encoding="raw", actor_average_rate=1.0, policy_input="achieved_desired_observation"
+            ),
         )
     config = TrainConfig(
         steps=300_000,
@@ -76,7 +78,7 @@ def _thesis(algo: Algorithm) -> TrainConfig:
             batch_size=4_096,
             max_demo_ratio=0.1,
             reach_zero=500_000,
-            num_sampled_goals=4,
+            num_sampled_goals=4.0,
             hindrl_sampling_strategy="task_conditioned",
             n_step=1,
             gamma=0.99,
@@ -90,7 +92,11 @@ def _thesis(algo: Algorithm) -> TrainConfig:
             top_quantiles_to_drop_per_net=2,
             target_update_rate=0.005,
             initial_alpha=1.0,
+            target_entropy=None,
+            final_target_entropy=None,
             bc_weight=1.0,
+            input_encoding="raw",
+            actor_average_rate=1.0,
             policy_input="achieved_desired_observation",
         ),
     )

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from hindrl_jax.config import BatchConfig
+from hindrl_jax.errors import UserError
 from hindrl_jax.goals import GoalTable, goal_reached
 from hindrl_jax.relabel import hindsight_steps, relabelled_goals
 from hindrl_jax.types import Array, Episodes, Transition
@@ -41,11 +42,11 @@ def init(*, num_envs: int, capacity: int, horizon: int, observation_dim: int, ac
       observation_dim, action_dim, goal_dim: D, A, G.
 
     Raises:
-      ValueError: if the capacity is below two episodes per environment (one being written, one to sample).
+      UserError: if the capacity is below two episodes per environment (one being written, one to sample).
     """
     slots = capacity // (num_envs * horizon)
     if slots < 2:
-        raise ValueError(
+        raise UserError(
             f"buffer_size = {capacity} is too small: {num_envs} environments with episodes of up to {horizon} steps "
             f"need at least {2 * num_envs * horizon}"
         )
@@ -230,7 +231,8 @@ def sample_batch(
 
     rows = sample_episodes(key_episode, replay, size)
     steps = sample_steps(key_step, replay.episodes, rows)
-    relabelled_rows = (size - demo_rows) * config.num_sampled_goals // (config.num_sampled_goals + 1)
+    relabelled_share = config.num_sampled_goals / (config.num_sampled_goals + 1)
+    relabelled_rows = jnp.floor((size - demo_rows) * relabelled_share + 1e-3).astype(jnp.int32)  # the margin is for float32's rounding
     index = jnp.arange(size)
     relabelled = (index >= demo_rows) & (index < demo_rows + relabelled_rows)
     new_goals = replay.episodes.desired_goals[rows]

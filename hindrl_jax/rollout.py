@@ -69,17 +69,17 @@ def evaluate(key: Array, env: Environment, behavioural_goals: GoalTable, act: Ac
       act: the policy; it is given keys, and may ignore them.
       num_episodes: played side by side.
     """
-    key_reset, key_act = jax.random.split(key)
+    key_reset, key_play = jax.random.split(key)
     start = reset(key_reset, env, behavioural_goals, num_episodes)
     result = Evaluation(success=jnp.zeros(num_episodes, bool), length=jnp.zeros(num_episodes, jnp.int32))
 
-    def one_step(carry: tuple[Any, Array, Array, Evaluation], key: Array) -> tuple[tuple[Any, Array, Array, Evaluation], None]:
-        env_state, observation, over, result = carry
-        action = act(key, observation, start.desired_goal)
+    def one_step(carry: tuple[Array, Any, Array, Array, Evaluation], _: None) -> tuple[tuple[Array, Any, Array, Array, Evaluation], None]:
+        key, env_state, observation, over, result = carry
+        key, key_act = jax.random.split(key)
+        action = act(key_act, observation, start.desired_goal)
         env_state, time_step = jax.vmap(env.step)(env_state, action_to_env(action, env))
         result = Evaluation(success=result.success | (~over & (time_step.reward > 0.0)), length=result.length + ~over)
-        return (env_state, time_step.observation, over | time_step.terminated | time_step.truncated, result), None
+        return (key, env_state, time_step.observation, over | time_step.terminated | time_step.truncated, result), None
 
-    carry = (start.env_state, start.observation, jnp.zeros(num_episodes, bool), result)
-    (_, _, _, result), _ = jax.lax.scan(one_step, carry, jax.random.split(key_act, env.horizon))
-    return result
+    carry = (key_play, start.env_state, start.observation, jnp.zeros(num_episodes, bool), result)
+    return jax.lax.scan(one_step, carry, length=env.horizon)[0][-1]

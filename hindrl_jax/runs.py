@@ -26,6 +26,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from experts.recording import RecordableEnvironment, play
 from hindrl_jax import plots, rollout
 from hindrl_jax import train as training
+from hindrl_jax.agent import InputScale
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.errors import UserError
 from hindrl_jax.experiment import Result, Row
@@ -186,7 +187,7 @@ def save_run(path: str | os.PathLike[str], result: Result, *, demos: str = "give
 
     Args:
       path: the directory.
-      result: from `train`.
+      result: from `fit`.
       demos: where the demonstrations came from, a number or a path; needed only to run it again with `hindrl train --config`.
       overwrite: replace a run that is there.
 
@@ -224,9 +225,11 @@ class Run:
     path: Path
     spec: RunSpec
     summary: dict[str, Any] | None
-    actors: Any
+    policies: Any
     """Parameters of the policies, leaves (S, ...)."""
     behavioural_goals: GoalTable
+    """Leaves (S, ...)."""
+    scale: InputScale
     """Leaves (S, ...)."""
 
     def evaluate(self, *, episodes: int = 100, key: jax.Array | None = None, stochastic: bool = False) -> list[dict[str, float]]:
@@ -235,11 +238,11 @@ class Run:
 
         @jax.jit
         @jax.vmap
-        def play_episodes(key: jax.Array, actor: Any, goals: GoalTable) -> Any:
-            act = training.make_policy(actor, self.spec.env, self.spec.config, stochastic=stochastic)
+        def play_episodes(key: jax.Array, actor: Any, goals: GoalTable, scale: InputScale) -> Any:
+            act = training.make_policy(actor, scale, self.spec.env, self.spec.config, stochastic=stochastic)
             return rollout.evaluate(key, self.spec.env, goals, act, episodes)
 
-        result = jax.device_get(play_episodes(keys, self.actors, self.behavioural_goals))
+        result = jax.device_get(play_episodes(keys, self.policies, self.behavioural_goals, self.scale))
         return [
             {"seed": seed, "success": float(result.success[i].mean()), "episode_length": float(result.length[i].mean())}
             for i, seed in enumerate(self.spec.seeds)
@@ -262,8 +265,8 @@ class Run:
         if seed not in self.spec.seeds:
             raise UserError(f"{self.path} has no seed {seed}: choose one of {', '.join(map(str, self.spec.seeds))}")
         index = self.spec.seeds.index(seed)
-        actor, goals = jax.tree.map(lambda leaf: leaf[index], (self.actors, self.behavioural_goals))
-        policy = training.make_policy(actor, env, config, stochastic=stochastic)
+        actor, goals, scale = jax.tree.map(lambda leaf: leaf[index], (self.policies, self.behavioural_goals, self.scale))
+        policy = training.make_policy(actor, scale, env, config, stochastic=stochastic)
 
         def act(key: jax.Array, state: Any, observation: jax.Array) -> jax.Array:
             return action_to_env(policy(key, observation[None], goals.goals[:1])[0], env)
@@ -305,22 +308,25 @@ def load_run(path: str | os.PathLike[str], *, summary: dict[str, Any] | None = N
         with np.load(file, allow_pickle=False) as archive:
             tree = unflatten_dict({name: jnp.asarray(archive[name]) for name in archive.files}, sep="/")
         goals = GoalTable(goals=tree["behavioural_goals"]["goals"], count=tree["behavioural_goals"]["count"])
-        actors = tree["actor"]
+        scale = InputScale(observation=tree["input_scale"]["observation"], goal=tree["input_scale"]["goal"])
+        policies = tree["policy"]
     except (OSError, ValueError, KeyError, EOFError) as error:
         raise UserError(f"{file} is damaged ({str(error).splitlines()[0]}): train again") from error
     if summary is None and (path / SUMMARY).exists():
         summary = json.loads((path / SUMMARY).read_text())
-    return Run(path=path, spec=spec, summary=summary, actors=actors, behavioural_goals=goals)
+    return Run(path=path, spec=spec, summary=summary, policies=policies, behavioural_goals=goals, scale=scale)
 
 
 def _save_parameters(path: Path, result: Result) -> None:
-    agent, goals = result.state.agent, result.guidance.behavioural_goals
+    agent, goals, scale = result.state.agent, result.guidance.behavioural_goals, result.guidance.scale
     tree = {
+        "policy": agent.average_actor,
         "actor": agent.actor,
         "critics": agent.critics,
         "log_alpha": agent.log_alpha,
         "epsilon": result.guidance.epsilon,
         "behavioural_goals": {"goals": goals.goals, "count": goals.count},
+        "input_scale": {"observation": scale.observation, "goal": scale.goal},
     }
     temporary = path.with_suffix(".partial.npz")
     np.savez(temporary, **{name: np.asarray(leaf) for name, leaf in flatten_dict(tree, sep="/").items()})

@@ -15,8 +15,9 @@ from flax import struct
 
 from hindrl_jax import agent as agents
 from hindrl_jax import goals, replay, rollout
-from hindrl_jax.agent import AgentState, Metrics
+from hindrl_jax.agent import AgentState, InputScale, Metrics
 from hindrl_jax.config import TrainConfig
+from hindrl_jax.errors import UserError
 from hindrl_jax.goals import GoalTable
 from hindrl_jax.replay import ReplayState
 from hindrl_jax.rollout import Act, Evaluation, RolloutState
@@ -31,6 +32,7 @@ class Guidance:
     goals: GoalTable  # goals for task-conditioned relabelling, filtered or not
     behavioural_goals: GoalTable  # goals for rollouts
     epsilon: Array  # (G,) half-width of the goal box
+    scale: InputScale  # typical size of the networks' inputs
 
 
 @struct.dataclass(kw_only=True)
@@ -77,6 +79,7 @@ def guidance(demonstrations: Episodes, env: Environment, config: TrainConfig) ->
         ),
         behavioural_goals=behavioural_goals,
         epsilon=epsilon,
+        scale=agents.input_scale(demonstrations.observations, achieved, goals.is_visited(lengths, achieved.shape[1])),
     )
 
 
@@ -84,11 +87,11 @@ def init(key: Array, data: Guidance, env: Environment, config: TrainConfig) -> T
     """A fresh agent, an empty replay and `num_envs` episodes about to begin.
 
     Raises:
-      ValueError: if the replay is too small, or learning would start before the first episode is complete.
+      UserError: if the replay is too small, or learning would start before the first episode is complete.
     """
     key_agent, key_rollout, key_train = jax.random.split(key, 3)
     if config.algo != "bc" and config.learning_starts < config.num_envs * env.horizon:
-        raise ValueError(
+        raise UserError(
             f"learning_starts = {config.learning_starts} is too early: with {config.num_envs} environments and a horizon of "
             f"{env.horizon} no episode need be complete before {config.num_envs * env.horizon} steps"
         )
@@ -103,25 +106,13 @@ def init(key: Array, data: Guidance, env: Environment, config: TrainConfig) -> T
     )
 
 
-def make_policy(actor: Any, env: Environment, config: TrainConfig, *, stochastic: bool) -> Act:
+def make_policy(actor: Any, scale: InputScale, env: Environment, config: TrainConfig, *, stochastic: bool) -> Act:
     """The actor as a function of observations and goals: sampled actions, or the mean ones."""
 
     def act(key: Array, observation: Array, desired_goal: Array) -> Array:
-        inputs = agents.policy_input(observation, env.achieved_goal(observation), desired_goal, config.agent)
+        inputs = agents.network_inputs(observation, env.achieved_goal(observation), desired_goal, scale, config.agent)
         distribution = agents.policy(actor, inputs, config.agent, action_dim=env.action_dim)
         return distribution.sample(key)[0] if stochastic else distribution.mode
-
-    return act
-
-
-def _behaviour(actor: Any, env: Environment, config: TrainConfig) -> Act:
-    """The policy that collects experience: sampled actions, but the mean ones in the first `deterministic_envs` environments."""
-
-    def act(key: Array, observation: Array, desired_goal: Array) -> Array:
-        inputs = agents.policy_input(observation, env.achieved_goal(observation), desired_goal, config.agent)
-        distribution = agents.policy(actor, inputs, config.agent, action_dim=env.action_dim)
-        deterministic = jnp.arange(config.num_envs)[:, None] < config.deterministic_envs
-        return jnp.where(deterministic, distribution.mode, distribution.sample(key)[0])
 
     return act
 
@@ -158,9 +149,9 @@ def collect(state: TrainState, data: Guidance, *, env: Environment, config: Trai
     return jax.lax.scan(iteration, state, length=num_iterations)[0]
 
 
-def _network_inputs(batch: Transition, env: Environment, config: TrainConfig) -> dict[str, Array]:
+def _network_inputs(batch: Transition, scale: InputScale, env: Environment, config: TrainConfig) -> dict[str, Array]:
     return {
-        name: agents.policy_input(observation, env.achieved_goal(observation), batch.desired_goal, config.agent)
+        name: agents.network_inputs(observation, env.achieved_goal(observation), batch.desired_goal, scale, config.agent)
         for name, observation in (("inputs", batch.observation), ("next_inputs", batch.next_observation))
     }
 
@@ -172,13 +163,9 @@ def learn(state: TrainState, data: Guidance, *, env: Environment, config: TrainC
       The new state, and metrics averaged over the gradient steps.
     """
 
-    def gradient_step(agent: AgentState, step: tuple[Array, Transition]) -> tuple[AgentState, Metrics]:
-        key, batch = step
-        return agents.update(key, agent, batch, **_network_inputs(batch, env, config), config=config.agent)
-
     def iteration(state: TrainState, _: None) -> tuple[TrainState, Metrics]:
-        key, key_interact, key_batch, key_update = jax.random.split(state.key, 4)
-        act = _behaviour(state.agent.actor, env, config)
+        key, key_interact, key_batch, key_updates = jax.random.split(state.key, 4)
+        act = make_policy(state.agent.actor, data.scale, env, config, stochastic=True)
         state = _interact(key_interact, state.replace(key=key), data, env, act)
         draw = functools.partial(
             replay.sample_batch,
@@ -192,7 +179,17 @@ def learn(state: TrainState, data: Guidance, *, env: Environment, config: TrainC
         )
         num_updates = config.updates_per_iteration
         batches = jax.vmap(draw)(jax.random.split(key_batch, num_updates))
-        agent, metrics = jax.lax.scan(gradient_step, state.agent, (jax.random.split(key_update, num_updates), batches))
+        progress = jnp.minimum(state.env_steps / config.steps, 1.0)
+        entropy = agents.target_entropy(progress, config.agent, action_dim=env.action_dim)
+
+        def gradient_step(carry: tuple[Array, AgentState], batch: Transition) -> tuple[tuple[Array, AgentState], Metrics]:
+            key, agent = carry
+            key, key_update = jax.random.split(key)
+            inputs = _network_inputs(batch, data.scale, env, config)
+            agent, metrics = agents.update(key_update, agent, batch, **inputs, target_entropy=entropy, config=config.agent)
+            return (key, agent), metrics
+
+        (_, agent), metrics = jax.lax.scan(gradient_step, (key_updates, state.agent), batches)
         return state.replace(agent=agent, updates=state.updates + num_updates), jax.tree.map(jnp.mean, metrics)
 
     state, metrics = jax.lax.scan(iteration, state, length=num_iterations)
@@ -217,7 +214,7 @@ def clone(state: TrainState, data: Guidance, *, env: Environment, config: TrainC
             is_demonstration=True,
             config=config.batch,
         )
-        inputs = _network_inputs(batch, env, config)["inputs"]
+        inputs = _network_inputs(batch, data.scale, env, config)["inputs"]
         agent, metrics = agents.update_bc(state.agent, batch, inputs=inputs, config=config.agent)
         return state.replace(agent=agent, key=key, updates=state.updates + 1), metrics
 
@@ -229,5 +226,5 @@ def evaluate(
     key: Array, actor: Any, data: Guidance, *, env: Environment, config: TrainConfig, num_episodes: int, stochastic: bool = False
 ) -> Evaluation:
     """Plays fresh episodes with the actor, see `rollout.evaluate`."""
-    act = make_policy(actor, env, config, stochastic=stochastic)
+    act = make_policy(actor, data.scale, env, config, stochastic=stochastic)
     return rollout.evaluate(key, env, data.behavioural_goals, act, num_episodes)

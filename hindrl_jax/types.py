@@ -107,10 +107,11 @@ def action_from_env(action: Array, env: Environment) -> Array:
 
 
 def tree_where(condition: Array, if_true: Any, if_false: Any) -> Any:
-    """`jnp.where` over two pytrees of equal structure; `condition` (B,) selects along the leading axis. Typed keys are handled."""
+    """`jnp.where` over two pytrees of equal structure, random keys included; `condition` (B,) selects along the leading axis."""
 
     def select(a: Array, b: Array) -> Array:
-        mask = condition.reshape(condition.shape + (1,) * (a.ndim - condition.ndim))
-        return jnp.where(mask, a, b)
+        if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(select(jax.random.key_data(a), jax.random.key_data(b)), impl=jax.random.key_impl(a))
+        return jnp.where(condition.reshape(condition.shape + (1,) * (a.ndim - condition.ndim)), a, b)
 
     return jax.tree.map(select, if_true, if_false)

@@ -11,16 +11,17 @@ PURE = STANDARD_LIBRARY | {"jax", "flax", "optax", "chex"}
 
 # Module of the core -> the modules of the core that it may import.
 CORE = {
+    "errors": set(),
     "types": set(),
     "config": {"types"},
     "goals": {"types", "config"},
     "relabel": {"types", "config", "goals"},
-    "replay": {"types", "config", "goals", "relabel"},
+    "replay": {"errors", "types", "config", "goals", "relabel"},
     "networks": {"types", "config"},
     "losses": {"types"},
     "agent": {"types", "config", "networks", "losses"},
     "rollout": {"types", "config", "goals"},
-    "train": {"types", "config", "goals", "relabel", "replay", "networks", "losses", "agent", "rollout"},
+    "train": {"errors", "types", "config", "goals", "relabel", "replay", "networks", "losses", "agent", "rollout"},
 }
 ENVS = sorted(path for path in (ROOT / "envs").rglob("*.py") if path.stem != "viewer")
 VIEWERS = sorted((ROOT / "envs").rglob("viewer.py"))

@@ -57,8 +57,8 @@ def padded(demonstrations, *, horizon, padding):
     return jnp.asarray(table), jnp.array([len(goals) - 1 for goals in demonstrations], jnp.int32)
 
 
-@pytest.mark.parametrize("padding", [0.0, 1e6, np.nan])
-@pytest.mark.parametrize(("m", "k"), [(0, 0.0), (0, 2.0), (1, 0.0), (1, 1.5), (3, 1.0), (5, 1.0), (6, 1.0), (7, 1.0), (50, 1.0)])
+@pytest.mark.parametrize("padding", [1e6, np.nan])
+@pytest.mark.parametrize(("m", "k"), [(0, 0.0), (0, 2.0), (1, 1.5), (3, 1.0), (6, 1.0), (7, 1.0), (50, 1.0)])
 def test_epsilon_is_that_of_plain_loops_whatever_the_padding(m, k, padding):
     rng = np.random.default_rng(0)
     demonstrations = [rng.normal(size=(num, 2)) for num in (7, 2, 4, 6)]  # with m = 3, the second has no pair

@@ -1,4 +1,4 @@
-"""A corridor whose observations say which episode and which step they belong to, and tables of episodes encoded the same way."""
+"""A corridor whose observations say which episode and which step they belong to, and demonstrations of it."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ import numpy as np
 from flax import struct
 
 from hindrl_jax.types import Array, Episodes, TimeStep
+
+# Options of `jax.jit`: most of the time of the tests goes into compilation, and hardly any into the programs.
+FAST_COMPILATION = {"xla_backend_optimization_level": 0}
 
 
 @struct.dataclass(kw_only=True)
@@ -75,27 +78,6 @@ class Corridor:
 
     def task_goal(self) -> Array:
         return jnp.array([self.width])
-
-
-def encoded_episodes(lengths, *, horizon, terminated=None, action_dim=1) -> Episodes:
-    """Episode i has observation (i, t), action i + t / 100, reward 1000 i + t and desired goal (-i, -1); the padding is NaN, so that reading it shows."""
-    num, time = len(lengths), np.arange(horizon + 1, dtype=np.float32)
-    index = np.repeat(np.arange(num, dtype=np.float32)[:, None], horizon + 1, axis=1)
-    observations = np.stack([index, np.broadcast_to(time, index.shape)], axis=-1)
-    actions = np.repeat((index + time / 100)[:, :-1, None], action_dim, axis=-1)
-    rewards = (1000 * index + time)[:, :-1]
-    for i, length in enumerate(lengths):
-        observations[i, length + 1 :] = np.nan
-        actions[i, length:] = np.nan
-        rewards[i, length:] = np.nan
-    return Episodes(
-        observations=jnp.asarray(observations),
-        actions=jnp.asarray(actions),
-        rewards=jnp.asarray(rewards),
-        lengths=jnp.asarray(lengths, jnp.int32),
-        terminated=jnp.zeros(num, bool) if terminated is None else jnp.asarray(terminated, bool),
-        desired_goals=jnp.stack([-jnp.arange(num, dtype=jnp.float32), -jnp.ones(num)], axis=-1),
-    )
 
 
 def corridor_demonstrations(speeds=(1.0, 1.25, 0.8), *, env=None) -> Episodes:

@@ -1,0 +1,290 @@
+"""The agent on probe problems with known values: batches made by hand, a few hundred updates, small networks."""
+
+import functools
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy_env import FAST_COMPILATION
+
+from hindrl_jax import agent as agents
+from hindrl_jax.config import AgentConfig
+from hindrl_jax.networks import apply_critics
+from hindrl_jax.types import Transition
+
+# The entropy coefficient starts at e^-9 and aims far below the policy's entropy, so that it only falls: values are those of the plain return.
+CONFIG = AgentConfig(
+    net_arch=(16,),
+    learning_rate=1e-2,
+    num_quantiles=4,
+    top_quantiles_to_drop_per_net=0,
+    target_update_rate=0.1,
+    actor_average_rate=0.2,
+    initial_alpha=1e-4,
+    target_entropy=-50.0,
+    bc_weight=0.0,
+    input_encoding="raw",
+)
+NUM_UPDATES = 400
+B = 32
+
+
+def make_batch(*, action, reward, discount, observation=None, next_observation=None, is_demonstration=False):
+    """A batch of B rows of two-dimensional observations; scalars are repeated."""
+
+    def rows(values, width=None):
+        values = jnp.asarray(values, jnp.float32)
+        shape = (B,) if width is None else (B, width)
+        return jnp.broadcast_to(values.reshape((1,) * (len(shape) - values.ndim) + values.shape), shape)
+
+    return Transition(
+        observation=rows([0.0, 0.0] if observation is None else observation, 2),
+        action=rows(action, 1),
+        reward=rows(reward),
+        discount=rows(discount),
+        next_observation=rows([0.0, 0.0] if next_observation is None else next_observation, 2),
+        desired_goal=jnp.zeros((B, 1)),
+        is_demonstration=jnp.broadcast_to(jnp.asarray(is_demonstration), (B,)),
+    )
+
+
+UNIT_SCALE = agents.InputScale(observation=jnp.ones(2), goal=jnp.ones(1))
+
+
+def inputs_of(observation, config):
+    zeros = jnp.zeros((observation.shape[0], 1))
+    return agents.network_inputs(observation, zeros, zeros, UNIT_SCALE, config)
+
+
+@functools.partial(jax.jit, compiler_options=FAST_COMPILATION)
+def fresh_agent(key):
+    return agents.init(key, CONFIG, observation_dim=2, goal_dim=1, action_dim=1)
+
+
+@functools.partial(jax.jit, static_argnames="config", compiler_options=FAST_COMPILATION)
+def updates(key, start, batch, config):
+    given = dict(
+        inputs=inputs_of(batch.observation, config),
+        next_inputs=inputs_of(batch.next_observation, config),
+        target_entropy=agents.target_entropy(0.0, config, action_dim=1),
+    )
+
+    def step(state, key):
+        state, metrics = agents.update(key, state, batch, **given, config=config)
+        return state, (state, metrics)
+
+    return jax.lax.scan(step, start, jax.random.split(key, NUM_UPDATES))[1]
+
+
+def train(seed, batch, config=CONFIG, start=None):
+    """NUM_UPDATES updates on the same batch: the agent after each of them, and their metrics. All of it must be finite."""
+    start = fresh_agent(jax.random.key(seed)) if start is None else start
+    states, metrics = updates(jax.random.key(1000 + seed), start, batch, config)
+    chex.assert_tree_all_finite((states, metrics))
+    return states, metrics
+
+
+def last(states):
+    return jax.tree.map(lambda leaf: leaf[-1], states)
+
+
+@jax.jit
+def values(state, observation, action):
+    """Mean over critics and quantiles: (rows,)."""
+    return jnp.mean(apply_critics(state.critics, inputs_of(observation, CONFIG), action, CONFIG), axis=(0, 1))
+
+
+@jax.jit
+def mean_action(state, observation):
+    return agents.policy(state.actor, inputs_of(observation, CONFIG), CONFIG, action_dim=1).mode
+
+
+ACTIONS = np.linspace(-1.0, 1.0, B, dtype=np.float32)[:, None]
+
+
+def test_value_of_a_constant_reward_is_the_reward():
+    batch = make_batch(action=ACTIONS, reward=1.0, discount=0.0)
+    states, metrics = train(0, batch)
+    np.testing.assert_allclose(values(last(states), batch.observation, batch.action), 1.0, atol=0.05)
+    np.testing.assert_allclose(metrics["critic/value"][-1], 1.0, atol=0.05)
+    np.testing.assert_allclose(metrics["critic/target"], 1.0, atol=1e-6)
+    np.testing.assert_allclose(metrics["batch/reward"], B)
+
+
+def test_value_before_the_reward_is_discounted():
+    # Rows of state (0, 0) lead to (1, 1) without reward and with discount 0.7; rows of (1, 1) end with reward 1. Values 0.7 and 1.
+    first = np.arange(B) < B // 2
+    batch = make_batch(
+        action=np.tile(ACTIONS[: B // 2] * 2 + 1, (2, 1)),
+        reward=np.where(first, 0.0, 1.0),
+        discount=np.where(first, 0.7, 0.0),
+        observation=np.where(first[:, None], 0.0, 1.0) * np.ones(2),
+        next_observation=np.ones(2),
+    )
+    states, _ = train(1, batch)
+    np.testing.assert_allclose(values(last(states), batch.observation, batch.action), np.where(first, 0.7, 1.0), atol=0.08)
+
+
+@pytest.mark.parametrize(
+    ("num_dropped", "expected"),
+    [
+        (0, 6.5),  # the mean of 0, 1, 2, 3 and 10, 11, 12, 13
+        (2, 1.5),  # two per critic are four in all, and all of them go from the second critic
+    ],
+)
+def test_largest_atoms_of_all_critics_together_are_dropped(num_dropped, expected):
+    start = fresh_agent(jax.random.key(2))
+    last_layer = start.target_critics["params"]["Dense_1"]
+    last_layer = {"kernel": jnp.zeros_like(last_layer["kernel"]), "bias": jnp.array([[0.0, 1.0, 2.0, 3.0], [10.0, 11.0, 12.0, 13.0]])}
+    start = start.replace(target_critics={"params": {**start.target_critics["params"], "Dense_1": last_layer}})
+    batch = make_batch(action=ACTIONS, reward=0.0, discount=1.0)
+    _, metrics = train(2, batch, AgentConfig(**{**vars(CONFIG), "top_quantiles_to_drop_per_net": num_dropped}), start)
+    np.testing.assert_allclose(metrics["critic/target"][0], expected, atol=1e-3)  # alpha is 1e-4
+
+
+def test_policy_picks_the_rewarded_action():
+    batch = make_batch(action=ACTIONS, reward=1.0 - (ACTIONS[:, 0] - 0.5) ** 2, discount=0.0)
+    states, _ = train(3, batch)
+    np.testing.assert_allclose(mean_action(last(states), batch.observation), 0.5, atol=0.2)
+
+
+@pytest.mark.parametrize(("bc_loss", "bc_action"), [("squared", "mean"), ("norm", "sample")])
+def test_behaviour_cloning_follows_demonstrations_alone(bc_loss, bc_action):
+    # Demonstrations play 0.4 in (0, 0) and -0.6 in (1, 1); every other row plays 0.9 and is rewarded for it.
+    kind = np.arange(B) % 4
+    batch = make_batch(
+        action=np.choose(kind, [0.4, -0.6, 0.9, 0.9])[:, None],
+        reward=np.where(kind >= 2, 1.0, 0.0),
+        discount=0.0,
+        observation=(kind % 2)[:, None] * np.ones(2),
+        is_demonstration=kind < 2,
+    )
+    config = AgentConfig(**{**vars(CONFIG), "bc_weight": 100.0, "bc_loss": bc_loss, "bc_action": bc_action})
+    start = fresh_agent(jax.random.key(4))
+    states, metrics = train(4, batch, config, start)
+    actions = mean_action(last(states), jnp.array([[0.0, 0.0], [1.0, 1.0]]))
+    np.testing.assert_allclose(actions[:, 0], [0.4, -0.6], atol=0.1)
+    # The first loss says whether the mean action was compared, or one with noise on it.
+    distance = np.abs(mean_action(start, batch.observation) - batch.action)[:, 0] * (kind < 2)
+    of_mean = np.mean(distance**2 if bc_loss == "squared" else distance)
+    assert (float(metrics["actor/bc_loss"][0]) == pytest.approx(of_mean, rel=1e-4)) == (bc_action == "mean")
+
+
+@pytest.mark.parametrize("rises", [True, False])
+def test_entropy_coefficient_moves_towards_minus_the_action_dimensions(rises):
+    # The default target is -1 here. A fresh policy has an entropy near log 2; with log_std lowered by 5 it is near -3.6.
+    start = fresh_agent(jax.random.key(5)).replace(log_alpha=jnp.asarray(np.log(0.5), jnp.float32))
+    start.actor["params"]["Dense_1"]["bias"] = jnp.array([0.0, -5.0 if rises else 0.0])
+    batch = make_batch(action=ACTIONS, reward=0.0, discount=0.0)
+    states, metrics = train(5, batch, AgentConfig(**{**vars(CONFIG), "target_entropy": None}), start)
+    alphas = np.append(0.5, np.exp(states.log_alpha[:10]))
+    np.testing.assert_allclose(metrics["alpha/value"][:11], alphas, rtol=1e-5)
+    # Adam's steps are one learning rate long in log alpha while the gradient keeps its sign.
+    np.testing.assert_allclose(np.diff(np.log(alphas)), 0.01 if rises else -0.01, rtol=0.2)
+    # The loss log alpha * (entropy - target) tells which target it was.
+    np.testing.assert_allclose(metrics["alpha/loss"][0], np.log(0.5) * (metrics["actor/entropy"][0] + 1.0), rtol=1e-4)
+
+
+def test_entropy_bonus_enters_the_target():
+    # With alpha = 1/2 the target of a rewardless step with discount 1 is Z' - alpha log pi = Z' + alpha * entropy.
+    batch = make_batch(action=ACTIONS, reward=0.0, discount=1.0)
+    target, entropy = {}, {}
+    for alpha in (0.5, 1e-4):
+        _, metrics = train(6, batch, start=fresh_agent(jax.random.key(6)).replace(log_alpha=jnp.asarray(np.log(alpha), jnp.float32)))
+        target[alpha], entropy[alpha] = float(metrics["critic/target"][0]), float(metrics["actor/entropy"][0])
+    # Two independent samples of 32 actions estimate the same entropy.
+    assert target[0.5] - target[1e-4] == pytest.approx(0.5 * entropy[0.5], abs=0.15)
+    assert entropy[0.5] > 0.3
+
+
+def test_action_penalty_pulls_the_mean_before_tanh_to_zero():
+    # Reward grows with the action without bound; a large weight on the squared mean outweighs it.
+    batch = make_batch(action=ACTIONS, reward=ACTIONS[:, 0], discount=0.0)
+    free, _ = train(10, batch)
+    held, _ = train(10, batch, AgentConfig(**{**vars(CONFIG), "action_l2": 100.0}))
+    assert mean_action(last(free), batch.observation).min() > 0.8
+    assert np.abs(mean_action(last(held), batch.observation)).max() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "entropies"),  # at the beginning, after a quarter, and at the end
+    [(None, None, [-3.0, -3.0, -3.0]), (-1.0, None, [-1.0, -1.0, -1.0]), (None, 5.0, [-3.0, -1.0, 5.0]), (4.0, 0.0, [4.0, 3.0, 0.0])],
+)
+def test_target_entropy_by_hand(start, end, entropies):
+    config = AgentConfig(target_entropy=start, final_target_entropy=end)
+    assert [agents.target_entropy(progress, config, action_dim=3) for progress in (0.0, 0.25, 1.0)] == entropies
+
+
+def test_target_critics_and_average_actor_move_by_their_rates():
+    before = fresh_agent(jax.random.key(7))
+    chex.assert_trees_all_equal(before.target_critics, before.critics)
+    chex.assert_trees_all_equal(before.average_actor, before.actor)
+    states, _ = train(7, make_batch(action=ACTIONS, reward=1.0, discount=0.5), start=before)
+    chex.assert_trees_all_equal_dtypes(before, states)
+    after = jax.tree.map(lambda leaf: leaf[0], states)
+    chex.assert_trees_all_equal_shapes(before, after)
+    moved = jax.tree.map(lambda old, new: 0.9 * old + 0.1 * new, before.target_critics, after.critics)
+    chex.assert_trees_all_close(after.target_critics, moved, rtol=1e-5, atol=1e-7)
+    moved = jax.tree.map(lambda old, new: 0.8 * old + 0.2 * new, before.average_actor, after.actor)
+    chex.assert_trees_all_close(after.average_actor, moved, rtol=1e-5, atol=1e-7)
+    assert max(np.abs(a - b).max() for a, b in zip(*map(jax.tree.leaves, (before.critics, after.critics)), strict=True)) > 1e-3
+
+
+# Observation (1, 2) over (2, 4) is (1/2, 1/2); achieved goal 3 over 6 is 1/2, too, and desired goal 0 is 0.
+HALF = [0.5, np.tanh(2.0)]
+
+
+@pytest.mark.parametrize(
+    ("encoding", "form", "expected"),
+    [
+        ("raw", "observation_goal", [1.0, 2.0, 0.0]),
+        ("raw", "achieved_desired_observation", [3.0, 0.0, 1.0, 2.0]),
+        ("multiscale", "observation_goal", [0.5, 0.5, HALF[1], HALF[1], 0.0, 0.0]),
+        ("multiscale", "achieved_desired_observation", [*HALF, 0.0, 0.0, 0.5, 0.5, HALF[1], HALF[1]]),
+    ],
+)
+def test_network_inputs_by_hand(encoding, form, expected):
+    scale = agents.InputScale(observation=jnp.array([2.0, 4.0]), goal=jnp.array([6.0]))
+    config = AgentConfig(policy_input=form, input_encoding=encoding, net_arch=(3,))
+    parts = (jnp.array([[1.0, 2.0]]), jnp.array([[3.0]]), jnp.array([[0.0]]))
+    np.testing.assert_allclose(agents.network_inputs(*parts, scale, config), [expected], rtol=1e-6)
+    unbatched = agents.network_inputs(*(part[0] for part in parts), scale, config)
+    np.testing.assert_allclose(unbatched, expected, rtol=1e-6)
+    state = jax.eval_shape(lambda key: agents.init(key, config, observation_dim=2, goal_dim=1, action_dim=1), jax.random.key(0))
+    assert state.actor["params"]["Dense_0"]["kernel"].shape == (len(expected), 3)
+
+
+@pytest.mark.parametrize("padding", [7.0, np.nan])
+def test_input_scale_by_hand(padding):
+    # Three states count: (3, 0), (4, 0) and (5, 0); root mean squares sqrt(50 / 3) and, always zero, 1.
+    observations = jnp.array([[[3.0, 0.0], [4.0, 0.0]], [[5.0, 0.0], [padding, padding]]])
+    scale = agents.input_scale(observations, observations[..., :1], jnp.array([[True, True], [True, False]]))
+    np.testing.assert_allclose(scale.observation, [(50 / 3) ** 0.5, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(scale.goal, [(50 / 3) ** 0.5], rtol=1e-6)
+
+
+def test_initial_alpha():
+    np.testing.assert_allclose(fresh_agent(jax.random.key(0)).log_alpha, np.log(1e-4), rtol=1e-6)
+
+
+def test_update_bc_overfits_a_tiny_batch_and_touches_only_the_actor():
+    observation = np.random.default_rng(0).normal(size=(B, 2))
+    batch = make_batch(action=0.8 * np.sin(observation[:, :1]), reward=0.0, discount=0.0, observation=observation)
+    inputs = inputs_of(batch.observation, CONFIG)
+
+    @jax.jit
+    def clone(start):
+        return jax.lax.scan(lambda state, _: agents.update_bc(state, batch, inputs=inputs, config=CONFIG), start, length=NUM_UPDATES)
+
+    start = fresh_agent(jax.random.key(9))
+    end, metrics = clone(start)
+    chex.assert_tree_all_finite((end, metrics))
+    first, final = metrics["actor/bc_loss"][0], metrics["actor/bc_loss"][-1]
+    np.testing.assert_allclose(first, np.mean((mean_action(start, batch.observation) - batch.action) ** 2), rtol=1e-4)  # over all rows
+    assert final < 0.01 < 0.1 < first
+    chex.assert_trees_all_close(end.average_actor, end.actor, atol=0.05)  # it has followed
+    assert np.abs(end.average_actor["params"]["Dense_0"]["kernel"] - start.actor["params"]["Dense_0"]["kernel"]).max() > 0.1
+    for name in ("critics", "target_critics", "log_alpha", "critic_optimiser", "alpha_optimiser"):
+        chex.assert_trees_all_equal(getattr(start, name), getattr(end, name))

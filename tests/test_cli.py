@@ -1,0 +1,231 @@
+"""The command line: what it writes, and how it refuses. Runs in process; the one training run is tiny and shared by the tests that read it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shlex
+import subprocess
+import sys
+
+import h5py
+import numpy as np
+import pytest
+
+from hindrl_jax import cli
+
+TINY = shlex.split(
+    "--num-envs 2 --learning-starts 200 --steps 260 --eval-every 40 --eval-episodes 3 --updates-per-iteration 1 "
+    "--batch-size 16 --net-arch 8 --buffer-size 2000"
+)
+SEED_FIELDS = {"seed", "final_success", "best_success", "env_steps_to_95", "updates_to_95", "seconds_to_95", "episode_length"}
+TOTALS = {"updates_per_second", "env_steps_per_second", "compile_seconds", "train_seconds", "peak_memory_bytes"}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A finished run of two seeds."""
+    path = tmp_path_factory.mktemp("runs") / "tiny"
+    cli.main(["train", "--env", "FixedGridPickAndPlace", "--demos", "1", "--seeds", "2", "--seed", "5", "--out", str(path), *TINY])
+    return path
+
+
+@pytest.fixture
+def demos_file(tmp_path):
+    path = tmp_path / "demos.hdf5"
+    cli.main(["demos", "record", "--env", "FixedGridPickAndPlace", "--demos", "2", "--out", str(path)])
+    return path
+
+
+def refusal(capsys, *arguments) -> str:
+    """Runs a command that must be refused; returns its one line."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stop:
+        cli.main([str(argument) for argument in arguments])
+    assert stop.value.code == 2
+    printed = capsys.readouterr()
+    assert printed.err.startswith("hindrl: ")
+    assert printed.err.count("\n") == 1, printed.err
+    assert "Traceback" not in printed.err
+    return printed.err
+
+
+def test_run_directory_holds_what_it_promises(run):
+    assert {file.name for file in run.iterdir()} == {
+        "config.json",
+        "metrics.csv",
+        "summary.json",
+        "parameters.npz",
+        "curve.png",
+        "episode.gif",
+    }
+    summary = json.loads((run / "summary.json").read_text())
+    assert set(summary) == TOTALS | {"seeds"}
+    assert [set(seed) for seed in summary["seeds"]] == [SEED_FIELDS] * 2
+    assert [seed["seed"] for seed in summary["seeds"]] == [5, 6]
+    assert all(seed["env_steps_to_95"] is None for seed in summary["seeds"])
+    rows = list(csv.DictReader((run / "metrics.csv").open()))
+    # 200 random steps, then chunks of 4 steps (a tenth of eval_every, in steps of 2 environments): evaluations at 240 and 260 for 2 seeds
+    assert [(row["seed"], row["env_steps"], row["updates"]) for row in rows] == [
+        ("5", "240", "20"),
+        ("6", "240", "20"),
+        ("5", "260", "30"),
+        ("6", "260", "30"),
+    ]
+    assert all(np.isfinite(float(value)) for row in rows for value in row.values())
+    with np.load(run / "parameters.npz", allow_pickle=False) as archive:
+        assert archive["policy/params/Dense_0/kernel"].shape == (2, 40, 8)
+
+
+def test_config_runs_again_and_other_flags_change_it(run, tmp_path):
+    again = tmp_path / "again"
+    cli.main(["train", "--config", str(run), "--out", str(again)])
+    assert (again / "config.json").read_text() == (run / "config.json").read_text()
+    with np.load(run / "parameters.npz") as first, np.load(again / "parameters.npz") as second:
+        for name in first.files:
+            np.testing.assert_array_equal(first[name], second[name])
+    spec, _ = cli._parse_train(["--config", str(run / "config.json"), "--learning-rate", "0.5", "--seeds", "1"])
+    assert (spec.config.agent.learning_rate, spec.seeds, spec.config.batch.batch_size) == (0.5, (5,), 16)
+
+
+def test_eval_and_render_read_the_run_back(run, tmp_path, capsys):
+    cli.main(["eval", str(run), "--episodes", "4", "--stochastic"])
+    assert "4 episodes per seed" in capsys.readouterr().out
+    film = tmp_path / "film.gif"
+    cli.main(["render", str(run), "--to", str(film), "--seed", "6"])
+    assert film.read_bytes().startswith(b"GIF89a")
+    assert "no seed 7" in refusal(capsys, "render", run, "--seed", 7, "--to", tmp_path / "other.gif")
+    assert not (tmp_path / "other.gif").exists()
+    assert "must end in .gif or .png" in refusal(capsys, "render", run, "--to", tmp_path / "film.avi")
+
+
+def test_existing_run_is_refused_and_kept(run, capsys):
+    before = {file.name: file.read_bytes() for file in run.iterdir()}
+    assert "already holds a run" in refusal(capsys, "train", "--out", run, *TINY)
+    # even with --overwrite, nothing is lost when the rest of the command is not usable
+    refusal(capsys, "train", "--out", run, "--overwrite", "--demos", "missing.hdf5", *TINY)
+    refusal(capsys, "train", "--out", run, "--overwrite", "--buffer-size", "100")
+    assert {file.name: file.read_bytes() for file in run.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "needs a command"),
+        (["trian"], "did you mean 'train'?"),
+        (["train", "--env", "FixedGrid"], "unknown environment 'FixedGrid' (did you mean"),
+        (["train", "--algo", "sac"], "unknown algorithm 'sac'"),
+        (["train", "--preset", "paper"], "unknown preset 'paper'"),
+        (["train", "--lerning-rate", "1"], "did you mean --learning-rate?"),
+        (["train", "--learning-rate", "fast"], "fast"),
+        (["train", "--learning-rate", "nan"], "learning_rate = nan"),
+        (["train", "--gamma", "1.5"], "gamma = 1.5"),
+        (["train", "--demos", "0"], "num_demos = 0"),
+        (["train", "--demos", "-3"], "num_demos = -3"),
+        (["train", "--demos", "missing.hdf5"], "missing.hdf5"),
+        (["train", "--seeds", "0"], "--seeds 0"),
+        (["train", "--seed", "-1"], "--seed -1"),
+        (["train", "--batch-size", "4", "--max-demo-ratio", "1.0"], "leaves no replay row"),
+        (["train", "--learning-starts", "10"], "learning_starts = 10"),
+        (["train", "--steps", "100"], "steps = 100"),
+        (["train", "--buffer-size", "200"], "buffer_size = 200"),
+        (["train", "--num-objects", "99"], "99"),
+        (["train", "--algo", "tqcfd", "--num-sampled-goals", "3"], "num_sampled_goals = 3"),
+        (["train", "--config", "missing.json"], "missing.json"),
+        (["train", "--config", "x", "--algo", "bc"], "exclude each other"),
+        (["eval", "missing"], "missing"),
+        (["render", "missing"], "missing"),
+        (["demos", "info", "missing.hdf5"], "missing.hdf5"),
+        (["demos", "record", "--demos", "0", "--out", "x.hdf5"], "num_demos = 0"),
+        (["demos", "forget"], "'forget' is not a command"),
+    ],
+)
+def test_bad_input_is_one_line_and_writes_nothing(arguments, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert message in refusal(capsys, *arguments)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bad_demonstration_files_are_refused(demos_file, tmp_path, capsys):
+    other = tmp_path / "other.hdf5"
+    cli.main(["demos", "record", "--env", "GridPickAndPlace", "--demos", "1", "--out", str(other)])
+    assert "GridPickAndPlace" in refusal(capsys, "train", "--env", "FixedGridPickAndPlace", "--demos", other)
+    assert "num_objects" in refusal(capsys, "train", "--env", "GridPickAndPlace", "--num-objects", 3, "--demos", other)
+    assert "already exists" in refusal(capsys, "demos", "record", "--demos", 1, "--out", other)
+    text = tmp_path / "text.hdf5"
+    text.write_text("not a file of numbers")
+    refusal(capsys, "train", "--demos", text)
+    cut = tmp_path / "cut.hdf5"
+    cut.write_bytes(demos_file.read_bytes()[: demos_file.stat().st_size // 2])
+    refusal(capsys, "train", "--demos", cut)
+    with h5py.File(demos_file, "r+") as file:
+        file["data/demo_1/actions"][3] = np.nan
+    assert "demo_1" in refusal(capsys, "train", "--demos", demos_file)
+    assert not (tmp_path / "runs").exists()
+
+
+def test_demonstrations_longer_than_the_horizon_are_dropped_with_a_warning(demos_file, capsys):
+    with h5py.File(demos_file) as file:
+        lengths = sorted(file[f"data/demo_{i}"].attrs["num_samples"] for i in range(2))
+    assert lengths[0] < lengths[1]
+    spec, _ = cli._parse_train(["--demos", str(demos_file), "--horizon", str(lengths[0])])
+    with pytest.warns(UserWarning, match="1 of 2"):
+        (demonstrations,) = cli._demonstrations(spec)
+    assert demonstrations.lengths.tolist() == [lengths[0]]
+    assert "horizon" in refusal(capsys, "train", "--demos", demos_file, "--horizon", lengths[0] - 1)
+
+
+def test_demos_info_and_render(demos_file, tmp_path, capsys):
+    capsys.readouterr()
+    cli.main(["demos", "info", str(demos_file), "--m", "5"])
+    printed = capsys.readouterr().out
+    assert "2 demonstrations, 2 solved" in printed
+    cli.main(["demos", "render", str(demos_file), "--demo", "1", "--to", str(tmp_path / "demo.png")])
+    assert (tmp_path / "demo.png").read_bytes().startswith(b"\x89PNG")
+    assert "no demonstration 2" in refusal(capsys, "demos", "render", demos_file, "--demo", 2)
+
+
+def test_envs_lists_every_environment(capsys):
+    cli.main(["envs"])
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in cli.TASKS)
+
+
+def test_every_config_field_is_a_flag():
+    arguments = ["--batch-size", "64", "--no-inclusive-goal-test", "--target-entropy", "-2.5", "--reach-zero", "None", "--num-objects", "3"]
+    spec, _ = cli._parse_train(arguments)
+    assert (spec.config.batch.batch_size, spec.config.batch.inclusive_goal_test) == (64, False)
+    assert (spec.config.agent.target_entropy, spec.config.batch.reach_zero, spec.env.num_objects) == (-2.5, None, 3)
+
+
+@pytest.mark.parametrize("algo", ["bc", "tqcfd", "hindrl", "smooth-hindrl"])
+@pytest.mark.parametrize("preset", ["default", "thesis", "original"])
+def test_presets_parse_and_survive_the_configuration_file(algo, preset, tmp_path):
+    spec, _ = cli._parse_train(["--algo", algo, "--preset", preset])
+    path = tmp_path / "config.json"
+    path.write_text(json.dumps(spec.to_json()))
+    assert cli.read_spec(path) == spec
+
+
+def test_configuration_files_are_checked_field_by_field(tmp_path, capsys):
+    spec, _ = cli._parse_train([])
+    good = spec.to_json()
+    path = tmp_path / "config.json"
+
+    def says(data) -> str:
+        path.write_text(json.dumps(data))
+        return refusal(capsys, "train", "--config", path)
+
+    assert "did you mean 'num_envs'" in says(good | {"config": good["config"] | {"num_envz": 3}})
+    assert "steps = 'many'" in says(good | {"config": good["config"] | {"steps": "many"}})
+    assert "did you mean 'num_objects'" in says(good | {"env_args": {"num_object": 3}})
+    assert "lacks 'seeds'" in says({name: value for name, value in good.items() if name != "seeds"})
+    assert "seeds = [-1]" in says(good | {"seeds": [-1]})
+    assert "does not hold" in says([1, 2])
+    path.write_text("{")
+    assert "cannot be read as JSON" in refusal(capsys, "train", "--config", path)
+
+
+def test_the_installed_command_starts():
+    done = subprocess.run([sys.executable, "-c", "from hindrl_jax.cli import main; main()", "--help"], capture_output=True, text=True, check=True)
+    assert "hindrl train" in done.stdout

@@ -1,0 +1,415 @@
+"""Replay: every stored number says which environment, episode and step it belongs to, so that a sample says where it came from.
+
+States are (environment, episode, step). Demonstrations take the place of environment 9. The achieved goal is the state itself, and the
+behavioural goal of an episode is (-1 - environment, episode, 0), which no state equals.
+"""
+
+import dataclasses
+import functools
+import math
+
+import hypothesis
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+from toy_env import FAST_COMPILATION
+
+from hindrl_jax import replay as replays
+from hindrl_jax.config import BatchConfig
+from hindrl_jax.goals import GoalTable
+from hindrl_jax.replay import num_demo_rows, sample_batch, sample_episodes, sample_steps, transitions
+from hindrl_jax.types import Episodes
+
+NUM_ENVS, HORIZON, SLOTS = 2, 3, 4
+NUM_ADDS = 40
+DEMO_LENGTHS = (3, 1, 2)
+DEMO = 9
+
+
+def reward_of(env, episode, step):
+    return 1000.0 * env + 10.0 * episode + step
+
+
+def is_terminated(episode):
+    return episode % 2 == 0
+
+
+def identity(observation):
+    return observation
+
+
+def demonstrations():
+    """Demonstrations 0 and 2 are solved, 1 is cut by the horizon; padding is NaN, so that reading it shows."""
+    num = len(DEMO_LENGTHS)
+    observations = np.full((num, HORIZON + 1, 3), np.nan, np.float32)
+    actions = np.full((num, HORIZON, 1), np.nan, np.float32)
+    rewards = np.full((num, HORIZON), np.nan, np.float32)
+    for i, length in enumerate(DEMO_LENGTHS):
+        for t in range(length + 1):
+            observations[i, t] = (DEMO, i, t)
+        for t in range(length):
+            actions[i, t] = rewards[i, t] = reward_of(DEMO, i, t)
+    return Episodes(
+        observations=jnp.asarray(observations),
+        actions=jnp.asarray(actions),
+        rewards=jnp.asarray(rewards),
+        lengths=jnp.array(DEMO_LENGTHS),
+        terminated=jnp.array([is_terminated(i) for i in range(num)]),
+        desired_goals=jnp.array([[-1.0 - DEMO, i, 0.0] for i in range(num)]),
+    )
+
+
+DEMO_STATES = [(DEMO, i, t) for i, length in enumerate(DEMO_LENGTHS) for t in range(length + 1)]
+TABLE = GoalTable(goals=jnp.array([*DEMO_STATES, (np.nan,) * 3], jnp.float32), count=jnp.asarray(len(DEMO_STATES)))
+
+
+@jax.jit
+def add_all(stream):
+    """The replay after each of the steps in `stream`: leaves (NUM_ADDS, ...)."""
+    start = replays.init(num_envs=NUM_ENVS, capacity=NUM_ENVS * HORIZON * SLOTS + 5, horizon=HORIZON, observation_dim=3, action_dim=1, goal_dim=3)
+
+    def add(state, step):
+        state = replays.add(state, **step)
+        return state, state
+
+    return jax.lax.scan(add, start, stream)[1]
+
+
+def replay_history(lengths):
+    """Plays episodes of the given lengths over and over.
+
+    Args:
+      lengths: one list of episode lengths per environment.
+
+    Returns:
+      The replay after each step, and for each step and environment the list of complete episodes: [step][env] -> [length, ...].
+    """
+    names = ("observation", "desired_goal", "action", "reward", "next_observation", "terminated", "truncated")
+    stream = {name: [] for name in names}
+    episode, step, complete, story = [0] * NUM_ENVS, [0] * NUM_ENVS, [[] for _ in range(NUM_ENVS)], []
+    for _ in range(NUM_ADDS):
+        row = {name: [] for name in names}
+        for env in range(NUM_ENVS):
+            now, t, length = episode[env], step[env], lengths[env][episode[env] % len(lengths[env])]
+            last = t + 1 == length
+            row["observation"].append((env, now, t))
+            row["desired_goal"].append((-1 - env, now, 0))
+            row["action"].append((reward_of(env, now, t),))
+            row["reward"].append(reward_of(env, now, t))
+            row["next_observation"].append((env, now, t + 1))
+            row["terminated"].append(last and is_terminated(now))
+            row["truncated"].append(last and not is_terminated(now))
+            if last:
+                complete[env].append(length)
+            episode[env], step[env] = (now + 1, 0) if last else (now, t + 1)
+        for name in names:
+            stream[name].append(row[name])
+        story.append([list(lengths) for lengths in complete])
+    return add_all({name: np.asarray(rows, bool if name in ("terminated", "truncated") else np.float32) for name, rows in stream.items()}), story
+
+
+def at(history, step):
+    return jax.tree.map(lambda leaf: leaf[step], jax.device_get(history))
+
+
+def kept(complete):
+    """What a ring must still hold: {(env, episode): length} of the newest complete episodes, one slot being kept free for writing."""
+    return {(env, episode): length for env, lengths in enumerate(complete) for episode, length in list(enumerate(lengths))[-(SLOTS - 1) :]}
+
+
+LENGTHS = st.lists(st.lists(st.integers(1, HORIZON), min_size=1, max_size=5), min_size=NUM_ENVS, max_size=NUM_ENVS)
+draw_episodes = jax.jit(sample_episodes, static_argnums=2)
+draw_steps = jax.jit(sample_steps)
+
+
+@hypothesis.settings(deadline=None, max_examples=30)
+@hypothesis.given(lengths=LENGTHS, step=st.integers(HORIZON - 1, NUM_ADDS - 1))
+@hypothesis.example(lengths=[[3], [3]], step=2)  # the first episode is just complete
+@hypothesis.example(lengths=[[3], [3]], step=8)  # all slots but one are complete
+@hypothesis.example(lengths=[[3], [3]], step=10)  # the last slot is being written
+@hypothesis.example(lengths=[[3], [3]], step=11)  # every slot has been written to its end
+@hypothesis.example(lengths=[[3], [3]], step=12)  # the first slot is being written again
+@hypothesis.example(lengths=[[1], [3, 2]], step=NUM_ADDS - 1)  # many times around, at different paces
+def test_samples_are_exactly_the_complete_episodes_still_held(lengths, step):
+    history, story = replay_history(lengths)
+    replay, expected = at(history, step), kept(story[step])
+    episodes = replay.episodes
+    # At most 6 episodes: the chance that 400 draws miss one is below 6 * (5/6)^400 < 1e-30.
+    rows = np.asarray(draw_episodes(jax.random.key(step), replay, 400))
+    assert {tuple(map(int, episodes.observations[row, 0, :2])) for row in rows} == set(expected)
+    for row in set(rows.tolist()):
+        env, episode = (int(number) for number in episodes.observations[row, 0, :2])
+        length = expected[env, episode]
+        assert episodes.lengths[row] == length
+        assert episodes.terminated[row] == is_terminated(episode)
+        assert episodes.desired_goals[row].tolist() == [-1 - env, episode, 0]
+        assert episodes.observations[row, : length + 1].tolist() == [[env, episode, t] for t in range(length + 1)]
+        rewards = [reward_of(env, episode, t) for t in range(length)]
+        assert episodes.rewards[row, :length].tolist() == rewards
+        assert episodes.actions[row, :length, 0].tolist() == rewards
+    steps = np.asarray(draw_steps(jax.random.key(1000 + step), episodes, rows))
+    assert set(zip(rows.tolist(), steps.tolist(), strict=True)) == {(row, t) for row in set(rows.tolist()) for t in range(episodes.lengths[row])}
+
+
+def test_complete_episodes_are_drawn_uniformly_whatever_their_environment():
+    # After 5 steps environment 0 has three complete episodes left of five, environment 1 has one. 4000 draws, 1000 each, deviation 27.
+    history, _ = replay_history([[1], [3]])
+    rows = np.asarray(draw_episodes(jax.random.key(0), at(history, 4), 4000))
+    counts = np.unique(rows, return_counts=True)[1]
+    assert len(counts) == 4
+    assert np.abs(counts - 1000).max() < 140
+
+
+def test_steps_are_drawn_uniformly():
+    steps = np.asarray(sample_steps(jax.random.key(0), demonstrations(), jnp.zeros(3000, jnp.int32)))
+    counts = np.bincount(steps)
+    assert len(counts) == 3
+    assert np.abs(counts - 1000).max() < 130  # deviation 26
+
+
+@functools.partial(jax.jit, static_argnames="config", compiler_options=FAST_COMPILATION)
+def draw_batch(key, replay, demo_rows, config):
+    return sample_batch(key, replay, demonstrations(), TABLE, achieved_goal=identity, epsilon=jnp.zeros(3), demo_rows=demo_rows, config=config)
+
+
+def expected_return(state, length, goal, *, relabelled, config):
+    """(reward, discount, next state) of the transition that starts in `state`, as a plain loop."""
+    env, episode, step = state
+    total, discount, following = 0.0, 1.0, state
+    for t in range(step, min(step + config.n_step, length)):
+        following = (env, episode, t + 1)
+        reached = relabelled and following == goal
+        total += discount * ((1.0 if reached else 0.0) if relabelled else reward_of(env, episode, t))
+        discount *= config.gamma
+        solved = t == length - 1 and (is_terminated(episode) or config.timeouts_are_terminal)
+        if solved or (reached and config.terminate_on_relabel):
+            return total, 0.0, following
+    return total, discount, following
+
+
+BATCH = BatchConfig(batch_size=64, max_demo_ratio=0.2, num_sampled_goals=3, gamma=0.5, n_step=2)
+NUM_DEMO, NUM_RELABELLED = 12, 39  # int(0.2 * 64), (64 - 12) * 3 // 4
+STRATEGIES = ("final", "future", "episode", "task_conditioned", "joint_union")
+
+
+def allowed_goals(strategy, state, length):
+    env, episode, step = state
+    first = {"final": length, "future": step + 1, "joint_union": step + 1, "episode": 0, "task_conditioned": length + 1}[strategy]
+    own = {(env, episode, t) for t in range(first, length + 1)}
+    return own | set(DEMO_STATES) if strategy in ("task_conditioned", "joint_union") else own
+
+
+def triples(array):
+    return [tuple(map(int, row)) for row in np.asarray(array)]
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_every_row_of_a_batch_comes_from_where_it_should(strategy):
+    config = dataclasses.replace(BATCH, hindrl_sampling_strategy=strategy)
+
+    @hypothesis.settings(deadline=None, max_examples=12)
+    @hypothesis.given(lengths=LENGTHS, step=st.integers(HORIZON - 1, NUM_ADDS - 1))
+    @hypothesis.example(lengths=[[3], [3]], step=11)
+    def check(lengths, step):
+        history, story = replay_history(lengths)
+        batch = jax.device_get(draw_batch(jax.random.key(step), at(history, step), NUM_DEMO, config))
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(batch))
+        assert np.asarray(batch.is_demonstration).tolist() == [True] * NUM_DEMO + [False] * (64 - NUM_DEMO)
+        sources = kept(story[step])
+        states, nexts, goals = triples(batch.observation), triples(batch.next_observation), triples(batch.desired_goal)
+        for row, (state, goal) in enumerate(zip(states, goals, strict=True)):
+            env, episode, t = state
+            length = DEMO_LENGTHS[episode] if row < NUM_DEMO else sources[env, episode]  # a KeyError here: not a complete episode
+            assert (env == DEMO) == (row < NUM_DEMO)
+            assert t < length
+            relabelled = NUM_DEMO <= row < NUM_DEMO + NUM_RELABELLED
+            assert goal in (allowed_goals(strategy, state, length) if relabelled else {(-1 - env, episode, 0)})
+            reward, discount, following = expected_return(state, length, goal, relabelled=relabelled, config=config)
+            assert (batch.reward[row], batch.discount[row]) == (reward, discount)  # exact, since gamma = 1/2
+            assert nexts[row] == following
+            assert batch.action[row, 0] == reward_of(env, episode, t)
+
+    check()
+
+
+def test_union_draws_from_both_sources_and_relabelling_can_be_off():
+    history, _ = replay_history([[3], [3]])
+    config = dataclasses.replace(BATCH, hindrl_sampling_strategy="joint_union")
+    batch = draw_batch(jax.random.key(0), at(history, 20), NUM_DEMO, config)
+    goals = np.asarray(batch.desired_goal)[NUM_DEMO : NUM_DEMO + NUM_RELABELLED, 0]
+    assert set(goals.tolist()) == {0.0, 1.0, DEMO}
+    batch = draw_batch(jax.random.key(0), at(history, 20), NUM_DEMO, dataclasses.replace(BATCH, num_sampled_goals=0))
+    assert np.all(np.asarray(batch.desired_goal)[:, 0] < 0)
+
+
+def test_jitted_equals_not_jitted():
+    def read(episodes, rows, steps, goals):
+        return transitions(
+            episodes,
+            rows,
+            steps,
+            achieved_goal=identity,
+            new_goals=goals,
+            relabelled=goals[:, 2] < 2,
+            epsilon=jnp.zeros(3),
+            is_demonstration=False,
+            config=BATCH,
+        )
+
+    arguments = (demonstrations(), jnp.array([0, 2, 2, 1]), jnp.array([1, 0, 1, 0]), jnp.array([[DEMO, 2.0, t] for t in range(4)]))
+    jax.tree.map(np.testing.assert_array_equal, jax.jit(read)(*arguments), read(*arguments))
+
+
+@pytest.mark.parametrize(
+    ("size", "demo", "relabelled", "original"),
+    [(4096, 409, 2949, 738), (12_000, 1200, 8640, 2160)],  # the thesis's two batches, with r = 0.1 and n = 4
+)
+def test_composition_of_the_batch(size, demo, relabelled, original):
+    config = BatchConfig(batch_size=size, max_demo_ratio=0.1, num_sampled_goals=4, hindrl_sampling_strategy="future", n_step=1)
+    history, _ = replay_history([[3], [2]])
+    batch = draw_batch(jax.random.key(0), at(history, 20), num_demo_rows(jnp.asarray(0), config), config)
+    assert config.max_demo_rows == demo
+    assert int(batch.is_demonstration.sum()) == demo
+    behavioural = np.asarray(batch.desired_goal)[:, 0] < 0  # demonstrations keep theirs, too
+    assert (~behavioural).sum() == relabelled
+    assert (behavioural & ~np.asarray(batch.is_demonstration)).sum() == original
+    sources, counts = np.unique(np.asarray(batch.observation)[:demo, 1], return_counts=True)
+    assert sources.tolist() == [0.0, 1.0, 2.0]
+    # Uniform by demonstration, not by step: a third each; five deviations of a binomial.
+    assert np.abs(counts - demo / 3).max() < 5 * (demo * 2 / 9) ** 0.5
+
+
+def test_demonstration_rows_fade_and_replay_rows_take_their_place():
+    history, _ = replay_history([[3], [2]])
+    for demo_rows in (0, 5):
+        batch = draw_batch(jax.random.key(0), at(history, 20), demo_rows, BATCH)
+        assert np.asarray(batch.is_demonstration).tolist() == [True] * demo_rows + [False] * (64 - demo_rows)
+        assert ((np.asarray(batch.observation)[:, 0] == DEMO) == np.asarray(batch.is_demonstration)).all()
+        goals = np.asarray(batch.desired_goal)[:, 0]
+        assert (goals == DEMO).sum() == (64 - demo_rows) * 3 // 4  # task-conditioned
+
+
+@pytest.mark.parametrize(
+    ("env_steps", "rows"),
+    [(0, 409), (1, 409), (250, 307), (500, 204), (999, 0), (1000, 0), (5000, 0)],  # floor(409.6 (1 - steps / 1000)); eq. 4.9
+)
+def test_linear_decay_of_the_demonstrations(env_steps, rows):
+    config = BatchConfig(batch_size=4096, max_demo_ratio=0.1, reach_zero=1000)
+    assert int(num_demo_rows(jnp.asarray(env_steps), config)) == rows
+    assert int(num_demo_rows(jnp.asarray(env_steps), dataclasses.replace(config, reach_zero=None))) == 409
+
+
+@hypothesis.settings(deadline=None, max_examples=50)
+@hypothesis.given(size=st.integers(2, 5000), percent=st.integers(0, 50))
+def test_decay_starts_with_the_full_number_of_rows(size, percent):
+    config = BatchConfig(batch_size=size, max_demo_ratio=percent / 100, reach_zero=10)
+    assert int(num_demo_rows(np.int32(0), config)) == config.max_demo_rows == math.floor(percent / 100 * size)
+
+
+def transition_twin(episodes, row, step, goal, *, relabelled, epsilon, config):
+    """(reward, discount, next observation, goal) as a plain loop; the achieved goal is entry 2 of an observation."""
+    length, total, discount = int(episodes.lengths[row]), 0.0, 1.0
+    for t in range(step, min(step + config.n_step, length)):
+        following = episodes.observations[row, t + 1]
+        distance = abs(following[2] - goal)
+        reached = relabelled and bool(distance <= epsilon if config.inclusive_goal_test else distance < epsilon)
+        total += discount * (float(reached) if relabelled else episodes.rewards[row, t])
+        discount *= config.gamma
+        over = t == length - 1 and (bool(episodes.terminated[row]) or config.timeouts_are_terminal)
+        if over or (reached and config.terminate_on_relabel):
+            discount = 0.0
+            break
+    return total, discount, following, goal if relabelled else episodes.desired_goals[row, 0]
+
+
+ROWS = 6
+
+
+@hypothesis.settings(deadline=None, max_examples=60)
+@hypothesis.given(
+    lengths=st.lists(st.integers(1, 4), min_size=3, max_size=3),
+    places=st.lists(st.integers(0, 2), min_size=15, max_size=15),
+    terminated=st.lists(st.booleans(), min_size=3, max_size=3),
+    chosen=st.lists(st.tuples(st.integers(0, 2), st.integers(0, 3), st.integers(0, 2), st.booleans()), min_size=ROWS, max_size=ROWS),
+    epsilon=st.sampled_from([0.0, 1.0]),
+    config=st.builds(
+        BatchConfig,
+        n_step=st.sampled_from([1, 3]),
+        gamma=st.sampled_from([0.5, 0.9, 1.0]),
+        inclusive_goal_test=st.booleans(),
+        terminate_on_relabel=st.booleans(),
+        timeouts_are_terminal=st.booleans(),
+    ),
+    is_demonstration=st.booleans(),
+)
+def test_transitions_are_those_of_a_plain_loop(lengths, places, terminated, chosen, epsilon, config, is_demonstration):
+    observations = np.zeros((3, 5, 3), np.float32)
+    observations[..., 0], observations[..., 1], observations[..., 2] = np.arange(3)[:, None], np.arange(5)[None], np.reshape(places, (3, 5))
+    rewards = np.arange(12, dtype=np.float32).reshape(3, 4) + 1.0
+    for i, length in enumerate(lengths):
+        observations[i, length + 1 :] = np.nan
+        rewards[i, length:] = np.nan
+    episodes = Episodes(
+        observations=observations,
+        actions=-rewards[..., None],
+        rewards=rewards,
+        lengths=np.array(lengths, np.int32),
+        terminated=np.array(terminated),
+        desired_goals=np.array([[-1.0], [-2.0], [-3.0]], np.float32),
+    )
+    rows = np.array([row for row, _, _, _ in chosen], np.int32)
+    steps = np.array([step % lengths[row] for row, step, _, _ in chosen], np.int32)
+    goals = np.array([[goal] for _, _, goal, _ in chosen], np.float32)
+    relabelled = np.array([flag for _, _, _, flag in chosen])
+    batch = transitions(
+        jax.tree.map(jnp.asarray, episodes),
+        jnp.asarray(rows),
+        jnp.asarray(steps),
+        achieved_goal=lambda observation: observation[..., 2:],
+        new_goals=jnp.asarray(goals),
+        relabelled=jnp.asarray(relabelled),
+        epsilon=jnp.array([epsilon]),
+        is_demonstration=is_demonstration,
+        config=config,
+    )
+    batch = jax.device_get(batch)
+    for i in range(ROWS):
+        reward, discount, following, goal = transition_twin(
+            episodes, rows[i], steps[i], goals[i, 0], relabelled=relabelled[i], epsilon=epsilon, config=config
+        )
+        np.testing.assert_allclose([batch.reward[i], batch.discount[i], batch.desired_goal[i, 0]], [reward, discount, goal], rtol=1e-5)
+        np.testing.assert_array_equal(batch.next_observation[i], following)
+        np.testing.assert_array_equal(batch.observation[i], observations[rows[i], steps[i]])
+        assert batch.action[i, 0] == -rewards[rows[i], steps[i]]
+    assert np.asarray(batch.is_demonstration).tolist() == [is_demonstration] * ROWS
+
+
+def test_last_row_of_a_solved_demonstration_is_worth_one_and_ends():
+    rewards = np.zeros((3, HORIZON), np.float32)
+    for i, length in enumerate(DEMO_LENGTHS):
+        rewards[i, length - 1] = 1.0
+    table = demonstrations().replace(rewards=jnp.asarray(rewards), terminated=jnp.ones(3, bool))
+    rows, steps = zip(*[(i, t) for i, length in enumerate(DEMO_LENGTHS) for t in range(length)], strict=True)
+    batch = transitions(
+        table,
+        jnp.array(rows),
+        jnp.array(steps),
+        achieved_goal=identity,
+        new_goals=jnp.zeros((6, 3)),
+        relabelled=jnp.zeros(6, bool),
+        epsilon=jnp.zeros(3),
+        is_demonstration=True,
+        config=BatchConfig(n_step=1, gamma=0.5),
+    )
+    assert batch.reward.tolist() == [0, 0, 1, 1, 0, 1]
+    assert batch.discount.tolist() == [0.5, 0.5, 0, 0, 0.5, 0]
+
+
+def test_capacity_is_at_least_two_episodes_per_environment():
+    dims = dict(horizon=10, observation_dim=1, action_dim=1, goal_dim=1)
+    with pytest.raises(ValueError, match=r"buffer_size = 59 is too small.*at least 60"):
+        replays.init(num_envs=3, capacity=59, **dims)
+    assert replays.init(num_envs=3, capacity=60, **dims).episodes.rewards.shape == (6, 10)
+    assert replays.init(num_envs=3, capacity=119, **dims).episodes.rewards.shape == (9, 10)

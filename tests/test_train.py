@@ -1,0 +1,397 @@
+"""Training end to end at toy size: what is counted, what is stored, what is compiled."""
+
+import dataclasses
+import functools
+import inspect
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toy_env import FAST_COMPILATION, Corridor, corridor_demonstrations
+
+from envs.grid import FixedGridPickAndPlace
+from hindrl_jax import rollout, train
+from hindrl_jax.config import AgentConfig, BatchConfig, GoalConfig, TrainConfig
+from hindrl_jax.types import Episodes
+
+NUM_ENVS, HORIZON, COLLECT_STEPS, LEARN_STEPS = 3, 7, 14, 3
+# Every program is traced once in this file, whoever calls it: each test builds its own, equal config and environment.
+STATIC = ("env", "config", "num_iterations", "num_episodes", "stochastic")
+
+
+def program(function, **options):
+    names = [name for name in inspect.signature(function).parameters if name in STATIC]
+    return jax.jit(chex.assert_max_traces(function, n=1), static_argnames=names, compiler_options=FAST_COMPILATION, **options)
+
+
+init, collect, clone, evaluate = program(train.init), program(train.collect), program(train.clone), program(train.evaluate)
+learn = program(train.learn, donate_argnums=0)
+
+
+def make_env():
+    return Corridor(horizon=HORIZON, width=4.0)
+
+
+def make_config(**changes):
+    """Relabels from both sources. The last of the 4 demonstration rows goes at step 50, within the first call of `learn`: 4 (1 - 50 / 66) < 1."""
+    config = TrainConfig(
+        num_envs=NUM_ENVS,
+        random_action_probability=1.0,
+        updates_per_iteration=2,
+        learning_starts=NUM_ENVS * HORIZON,
+        buffer_size=30_000,
+        steps=102,
+        batch=BatchConfig(batch_size=16, hindrl_sampling_strategy="joint_union", reach_zero=66),
+        goal=GoalConfig(m=1, k=1.0, epsilon_filtering=True),
+        agent=AgentConfig(net_arch=(8,), num_quantiles=5, top_quantiles_to_drop_per_net=1, target_entropy=-1000.0, final_target_entropy=1000.0),
+    )
+    return dataclasses.replace(config, **changes)
+
+
+@pytest.fixture(scope="module")
+def data():
+    return train.guidance(corridor_demonstrations((1.0, 1.25, 0.9), env=make_env()), make_env(), make_config())
+
+
+def collected(seed, data):
+    state = init(jax.random.key(seed), data, make_env(), make_config())
+    return collect(state, data, env=make_env(), config=make_config(), num_iterations=COLLECT_STEPS)
+
+
+def with_output_bias(state, bias):
+    """The state with an actor that has the same (mean, log_std) everywhere, whatever it sees."""
+    last = state.agent.actor["params"]["Dense_1"]
+    last = {"kernel": jnp.zeros_like(last["kernel"]), "bias": jnp.array(bias)}
+    actor = {"params": {**state.agent.actor["params"], "Dense_1": last}}
+    return state.replace(agent=state.agent.replace(actor=actor))
+
+
+@pytest.fixture(scope="module")
+def learnt(data):
+    """What `learn` made of the state after `collect`, by calling it twice; the first policy plays (0.5, -0.5), with hardly any noise."""
+    config = make_config()
+    start = with_output_bias(collected(0, data), [np.arctanh(0.5), np.arctanh(-0.5), -20.0, -20.0])
+    first, metrics_first = learn(start, data, env=make_env(), config=config, num_iterations=LEARN_STEPS)
+    snapshot = jax.device_get(first.replace(key=jax.random.key_data(first.key), rollout=None))
+    second, metrics_second = learn(first, data, env=make_env(), config=make_config(), num_iterations=LEARN_STEPS)
+    return snapshot, metrics_first, second, metrics_second
+
+
+def test_steps_are_counted(learnt):
+    first, _, second, _ = learnt
+    assert int(first.env_steps) == NUM_ENVS * (COLLECT_STEPS + LEARN_STEPS)
+    assert int(second.env_steps) == NUM_ENVS * (COLLECT_STEPS + 2 * LEARN_STEPS)
+    assert (int(first.updates), int(second.updates)) == (2 * LEARN_STEPS, 4 * LEARN_STEPS)
+    assert int(first.agent.critic_optimiser[0].count) == 2 * LEARN_STEPS
+    # What is in the replay is what was stepped: complete episodes, and the beginning of those under way.
+    episodes, slots = second.replay.episodes, second.replay.episodes.lengths.shape[0] // NUM_ENVS
+    assert slots == 30_000 // (NUM_ENVS * HORIZON)
+    assert int(episodes.lengths.sum() + second.replay.step.sum()) == int(second.env_steps)
+
+
+def test_everything_stays_finite_and_learns(learnt):
+    first, metrics_first, second, metrics_second = learnt
+    chex.assert_tree_all_finite((second.agent, metrics_first, metrics_second))
+    assert all(value.shape == () for value in metrics_first.values())
+    moved = jax.tree.map(lambda a, b: float(np.abs(a - b).max()), first.agent.critics, second.agent.critics)
+    assert min(jax.tree.leaves(moved)) > 0.0
+
+
+def test_demonstrations_fade_out_with_the_environment_steps(learnt):
+    _, metrics_first, _, metrics_second = learnt
+    assert metrics_first["actor/bc_loss"] > 0.0
+    assert metrics_second["actor/bc_loss"] == 0.0
+
+
+def test_target_entropy_moves_with_the_environment_steps(learnt):
+    # The target passes 0 after half of the 102 steps, which is where the first call ends. Log alpha has just begun to fall from 0, and stays
+    # negative; so the loss log alpha * (entropy - target) has the sign of the target, which is far from any entropy.
+    _, metrics_first, second, metrics_second = learnt
+    assert second.agent.log_alpha < 0.0
+    assert metrics_first["alpha/loss"] < 0.0 < metrics_second["alpha/loss"]
+
+
+def lived_episodes(state):
+    """(environment, length, observations, actions, rewards, terminated, goal) of the complete episodes, oldest first in each environment."""
+    episodes = jax.device_get(state.replay.episodes)
+    slots = len(episodes.lengths) // NUM_ENVS
+    for row in np.flatnonzero(episodes.lengths):
+        length = episodes.lengths[row]
+        yield (
+            row // slots,
+            length,
+            episodes.observations[row, : length + 1],
+            episodes.actions[row, :length],
+            episodes.rewards[row, :length],
+            episodes.terminated[row],
+            episodes.desired_goals[row],
+        )
+
+
+def test_replay_holds_what_was_lived(learnt, data):
+    goals = np.asarray(data.behavioural_goals.goals)
+    starts = []
+    for _, length, observations, actions, rewards, terminated, goal in lived_episodes(learnt[2]):
+        starts.append(observations[0, 0])
+        assert np.all(observations[:, 0] == observations[0, 0])  # one episode, not two
+        assert observations[:, 1].tolist() == list(range(length + 1))
+        np.testing.assert_allclose(np.diff(observations[:, 2]), actions[:, 0] + 1.0, atol=1e-5)  # policy units to velocities
+        assert rewards.tolist() == (observations[1:, 2] > 4.0).tolist()
+        assert bool(terminated) == bool(rewards[-1])
+        assert rewards[:-1].sum() == 0.0
+        assert terminated or length == HORIZON
+        assert np.any(goal == goals)
+        assert np.abs(actions).max() <= 1.0
+    assert len(starts) >= NUM_ENVS * 2
+    assert len(set(starts)) == len(starts)
+
+
+def test_random_actions_grow_from_the_first_environment_to_the_last(learnt):
+    replay = learnt[0].replay
+    slots = len(replay.episodes.lengths) // NUM_ENVS
+    actions, from_policy = [], np.array([0.5, -0.5])
+    for env in range(NUM_ENVS):
+        rows = replay.episodes.lengths[env * slots : (env + 1) * slots]
+        lived = [replay.episodes.actions[env * slots + slot, :length] for slot, length in enumerate(rows) if length]
+        lived.append(replay.episodes.actions[env * slots + replay.slot[env], : replay.step[env]])
+        actions.append(np.concatenate(lived))
+        assert len(actions[env]) == COLLECT_STEPS + LEARN_STEPS
+    # The policy has moved by a few Adam steps of 1e-3; a uniform action is as near as that to it with probability 1e-3 at most.
+    near = [np.all(np.abs(taken - from_policy) < 0.05, axis=1) for taken in actions]
+    assert not any(taken[:COLLECT_STEPS].any() for taken in near)  # uniform at first
+    assert near[0][COLLECT_STEPS:].all()
+    assert not near[-1][COLLECT_STEPS:].any()
+    assert all(taken[:COLLECT_STEPS].std() > 0.4 for taken in actions)  # U(-1, 1) has 0.58
+
+
+def stack(*trees):
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+
+
+def two_seeds(data):
+    return stack(collected(1, data), collected(2, data)), stack(data, data)
+
+
+@pytest.fixture(scope="module")
+def mapped(data):
+    """`learn` over two seeds, compiled as the experiments do."""
+    run = jax.vmap(functools.partial(train.learn, env=make_env(), config=make_config(), num_iterations=LEARN_STEPS))
+    return jax.jit(run, donate_argnums=0, compiler_options=FAST_COMPILATION).lower(*two_seeds(data)).compile()
+
+
+def test_a_seed_alone_equals_its_row_under_vmap(mapped, data):
+    together, metrics_together = mapped(*two_seeds(data))
+    for index, seed in enumerate((1, 2)):
+        alone, metrics = learn(collected(seed, data), data, env=make_env(), config=make_config(), num_iterations=LEARN_STEPS)
+        row = jax.tree.map(lambda leaf, index=index: leaf[index], (together.agent, together.replay, metrics_together))
+        chex.assert_trees_all_close((alone.agent, alone.replay, metrics), row, rtol=1e-3, atol=1e-4)
+    kernel = together.agent.critics["params"]["Dense_0"]["kernel"]
+    assert np.abs(kernel[0] - kernel[1]).max() > 0.01
+
+
+def test_the_replay_is_written_in_place(mapped, data):
+    """No copy of the replay: neither in the program's text nor among its buffers, and the donated state becomes the new one."""
+    episodes = collected(1, data).replay.episodes
+    leaves = [getattr(episodes, name) for name in ("observations", "actions", "rewards")]
+    text = mapped.as_text()
+    for leaf in leaves:
+        shape = f"f32[2,{','.join(map(str, leaf.shape))}]"
+        assert f"= {shape}" in text  # the shape is spelt as the program spells it
+        assert [line for line in text.splitlines() if f"= {shape}" in line and " copy" in line.split(shape, 1)[1].split("(", 1)[0]] == []
+    memory = mapped.memory_analysis()
+    smallest, replay = min(2 * leaf.nbytes for leaf in leaves), sum(2 * leaf.nbytes for leaf in leaves)
+    assert memory.temp_size_in_bytes < smallest
+    assert memory.alias_size_in_bytes > replay
+    assert memory.argument_size_in_bytes - memory.alias_size_in_bytes < smallest
+
+
+def test_donated_state_is_consumed(data):
+    state = collected(3, data)
+    observations = state.replay.episodes.observations
+    learn(state, data, env=make_env(), config=make_config(), num_iterations=LEARN_STEPS)
+    assert observations.is_deleted()
+
+
+def test_clone_trains_the_actor_on_demonstrations_alone(data):
+    config = make_config(algo="bc", learning_starts=0)
+    start = init(jax.random.key(0), data, make_env(), make_config())
+    state, losses = start, []
+    for _ in range(2):
+        state, metrics = clone(state, data, env=make_env(), config=make_config(algo="bc", learning_starts=0), num_iterations=500)
+        losses.append(float(metrics["actor/bc_loss"]))
+    chex.assert_tree_all_finite((state.agent, metrics))
+    assert losses[1] < losses[0]
+    assert (int(state.env_steps), int(state.updates)) == (0, 1000)
+    chex.assert_trees_all_equal(state.replay, start.replay)
+    chex.assert_trees_all_equal(state.agent.critics, start.agent.critics)
+    # Demonstrated second actions are -0.5 throughout; the policy has left 0 for them.
+    action = train.make_policy(state.agent.actor, data.scale, make_env(), config, stochastic=False)(
+        jax.random.key(0), data.demonstrations.observations[:, 0], data.demonstrations.desired_goals
+    )
+    np.testing.assert_allclose(action[:, 1], -0.5, atol=0.3)
+
+
+def test_evaluation_plays_the_mean_action_unless_asked_to_sample(data):
+    state = with_output_bias(init(jax.random.key(0), data, make_env(), make_config()), [0.0, 0.0, 0.0, 0.0])
+    for seed in (1, 2):
+        result = evaluate(jax.random.key(seed), state.agent.actor, data, env=make_env(), config=make_config(), num_episodes=20)
+        # Velocity 1 passes 4 in the fifth step.
+        assert result.length.tolist() == [5] * 20
+        assert result.success.tolist() == [True] * 20
+    sampling = functools.partial(train.evaluate, env=make_env(), config=make_config(), num_episodes=20, stochastic=True)
+    result = jax.jit(sampling)(jax.random.key(3), state.agent.actor, data)
+    assert len(set(result.length.tolist())) > 1
+
+
+def test_reset_and_step_are_traced_once(data):
+    reset = jax.jit(chex.assert_max_traces(rollout.reset, n=1), static_argnums=(1, 3))
+    step = jax.jit(chex.assert_max_traces(rollout.step, n=1), static_argnums=3)
+    state = reset(jax.random.key(0), make_env(), data.behavioural_goals, 4)
+    state = reset(jax.random.key(1), make_env(), data.behavioural_goals, 4)
+    for seed in range(3):
+        state, time_step = step(jax.random.key(seed), state, jnp.zeros((4, 2)), make_env(), data.behavioural_goals)
+    assert time_step.reward.shape == (4,)
+
+
+# One demonstration in steps of 1, whose achieved goals are 0, 1, 2, 3, 4, and one in steps of 2: 0, 2, 4. Lengths 4 and 2.
+TWO_SPEEDS = (1.0, 2.0)
+
+
+def guidance(goal=None, batch=None):
+    env = Corridor(horizon=5, width=3.0)
+    config = make_config(goal=goal or GoalConfig(), batch=batch or BatchConfig())
+    return train.guidance(corridor_demonstrations(TWO_SPEEDS, env=env), env, config)
+
+
+def goals_of(table):
+    return table.goals[: int(table.count), 0].tolist()
+
+
+def test_guidance_by_default():
+    data = guidance()
+    assert goals_of(data.goals) == [0.0, 1.0, 2.0, 3.0, 4.0, 0.0, 2.0, 4.0]
+    assert goals_of(data.behavioural_goals) == [4.0, 4.0]
+    assert data.epsilon.tolist() == [0.0]
+    # Root mean square of the 5 + 3 goals: (0 + 1 + 4 + 9 + 16 + 0 + 4 + 16) / 8 = 2.5^2.
+    np.testing.assert_allclose(data.scale.goal, [2.5], rtol=1e-6)
+    np.testing.assert_allclose(data.scale.observation[2], 2.5, rtol=1e-6)
+    demonstrations = data.demonstrations
+    assert demonstrations.desired_goals.tolist() == [[4.0], [4.0]]
+    given = corridor_demonstrations(TWO_SPEEDS)
+    for field in dataclasses.fields(Episodes):
+        if field.name != "desired_goals":
+            np.testing.assert_array_equal(getattr(demonstrations, field.name), getattr(given, field.name))
+
+
+def test_guidance_reads_no_padding():
+    env = Corridor(horizon=5, width=3.0)
+    clean = corridor_demonstrations(TWO_SPEEDS, env=env)
+    inside = (np.arange(6) <= np.asarray(clean.lengths)[:, None])[..., None]
+    dirty = clean.replace(observations=jnp.asarray(np.where(inside, clean.observations, np.nan)))
+    config = make_config(goal=GoalConfig(m=1, k=1.0, epsilon_filtering=True))
+    expected, found = (train.guidance(demonstrations, env, config) for demonstrations in (clean, dirty))
+    for name in ("epsilon", "behavioural_goals", "scale"):
+        chex.assert_trees_all_close(getattr(found, name), getattr(expected, name))
+    assert goals_of(found.goals) == goals_of(expected.goals)
+
+
+def test_behavioural_goal_may_be_the_one_of_the_task():
+    data = guidance(GoalConfig(behavioural_goals="task"))
+    assert goals_of(data.behavioural_goals) == [3.0]
+    assert data.demonstrations.desired_goals.tolist() == [[3.0], [3.0]]
+
+
+def test_last_goals_may_be_excluded():
+    assert goals_of(guidance(GoalConfig(exclude_last_goal=True)).goals) == [0.0, 1.0, 2.0, 3.0, 0.0, 2.0]
+
+
+def test_epsilon_and_filtering_follow_the_config():
+    # Distances one step apart: 1, 1, 1, 1, 2, 2. Mean 8 / 6, variance (4 * 1 + 2 * 4) / 6 - (8 / 6)^2 = 2 / 9.
+    assert guidance(GoalConfig(m=1)).epsilon[0] == pytest.approx(8 / 6)
+    data = guidance(GoalConfig(m=1, k=2.0, epsilon_filtering=True))
+    assert data.epsilon[0] == pytest.approx(8 / 6 + 2 * (2 / 9) ** 0.5)  # 2.28
+    assert goals_of(data.goals) == [0.0, 3.0, 0.0, 4.0]
+    # With m = 0 only equal neighbours are dropped, and not even those under the strict test.
+    assert goals_of(guidance(GoalConfig(epsilon_filtering=True)).goals) == [0.0, 1.0, 2.0, 3.0, 4.0, 0.0, 2.0, 4.0]
+
+
+def test_the_filter_uses_the_goal_test_of_the_batch():
+    env = Corridor(horizon=5, width=3.0)
+    kept = {}
+    for inclusive in (True, False):
+        config = make_config(goal=GoalConfig(m=1, epsilon_filtering=True), batch=BatchConfig(inclusive_goal_test=inclusive))
+        kept[inclusive] = goals_of(train.guidance(corridor_demonstrations((1.0,), env=env), env, config).goals)
+    # Epsilon is 1, the length of each step.
+    assert kept == {True: [0.0, 2.0, 4.0], False: [0.0, 1.0, 2.0, 3.0, 4.0]}
+
+
+def test_demonstrated_actions_may_be_left_in_units_of_the_environment():
+    actions = guidance(GoalConfig(rescale_demo_actions=False)).demonstrations.actions
+    assert actions[0, :4].tolist() == [[1.0, 0.5]] * 4
+    assert actions[1, :2].tolist() == [[2.0, 0.5]] * 2
+
+
+def test_demonstrated_actions_may_be_paired_with_the_observation_after_them():
+    env, given = make_env(), corridor_demonstrations((1.0, 1.25), env=make_env())
+    # Actions that tell their step.
+    given = given.replace(actions=given.actions.at[..., 1].set(np.arange(HORIZON) / 10.0 * np.ones((2, 1))))
+    lived = train.guidance(given, env, make_config(goal=GoalConfig(misalign_demo_actions=True))).demonstrations
+    assert lived.lengths.tolist() == [4, 3]
+    for row, length in enumerate((4, 3)):
+        assert lived.observations[row, : length + 1, 1].tolist() == list(range(1, length + 2))
+        np.testing.assert_allclose(lived.actions[row, :length, 1], np.arange(length) / 10.0)
+        assert lived.rewards[row, :length].tolist() == [0.0] * (length - 1) + [1.0]
+
+
+def test_learning_may_not_start_before_an_episode_is_complete(data):
+    def start(**changes):
+        return jax.eval_shape(lambda key: train.init(key, data, make_env(), make_config(**changes)), jax.random.key(0))
+
+    with pytest.raises(ValueError, match=r"learning_starts = 20 .* 21 steps"):
+        start(learning_starts=NUM_ENVS * HORIZON - 1)
+    with pytest.raises(ValueError, match="buffer_size = 41"):
+        start(buffer_size=2 * NUM_ENVS * HORIZON - 1)
+    start(learning_starts=NUM_ENVS * HORIZON, buffer_size=2 * NUM_ENVS * HORIZON)
+    start(algo="bc", learning_starts=0)
+
+
+def grid_demonstrations(env, num):
+    """Numbers of the right shapes; what the grid's expert does is its own test's concern."""
+    rng = np.random.default_rng(0)
+    return Episodes(
+        observations=jnp.asarray(rng.integers(-3, 4, size=(num, env.horizon + 1, env.observation_dim)), jnp.float32),
+        actions=jnp.asarray(rng.uniform(-1, 1, size=(num, env.horizon, env.action_dim)), jnp.float32),
+        rewards=jnp.zeros((num, env.horizon)).at[:, 5].set(1.0),
+        lengths=jnp.full(num, 6),
+        terminated=jnp.ones(num, bool),
+        desired_goals=jnp.zeros((num, env.goal_dim)),
+    )
+
+
+def test_grid_runs_end_to_end():
+    env = FixedGridPickAndPlace(size=4, random_box_size=1, horizon=8)
+    config = TrainConfig(
+        num_envs=2,
+        updates_per_iteration=1,
+        learning_starts=16,
+        buffer_size=64,
+        steps=100,
+        batch=BatchConfig(batch_size=8, n_step=2),
+        agent=AgentConfig(net_arch=(8,), num_critics=1, num_quantiles=3, top_quantiles_to_drop_per_net=1),
+    )
+
+    @functools.partial(jax.jit, compiler_options=FAST_COMPILATION)
+    def run(key):
+        key_init, key_evaluate = jax.random.split(key)
+        data = train.guidance(grid_demonstrations(env, 2), env, config)
+        state = train.collect(train.init(key_init, data, env, config), data, env=env, config=config, num_iterations=8)
+        state, metrics = train.learn(state, data, env=env, config=config, num_iterations=4)
+        return state, metrics, train.evaluate(key_evaluate, state.agent.actor, data, env=env, config=config, num_episodes=3)
+
+    state, metrics, evaluation = run(jax.random.key(0))
+    chex.assert_tree_all_finite((state.agent, metrics))
+    assert (int(state.env_steps), int(state.updates)) == (24, 4)
+    assert np.all(np.asarray(evaluation.length) <= 8)
+    assert state.replay.episodes.observations.shape == (8, 9, env.observation_dim)
