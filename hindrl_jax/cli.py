@@ -430,9 +430,19 @@ def _count(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
+def _keep_compiled_programs() -> None:
+    """Keeps compiled programs in the user's cache folder, so that a second start takes seconds. JAX's own settings win: JAX_COMPILATION_CACHE_DIR
+    names another folder, JAX_ENABLE_COMPILATION_CACHE=false turns it off."""
+    if jax.config.jax_compilation_cache_dir is None:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hindrl_jax"
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+
+
 def main(arguments: list[str] | None = None) -> None:
-    """Entry point of the `hindrl` command."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    """Entry point of the `hindrl` command; with arguments given, runs within this process as it is."""
+    if arguments is None:
+        arguments = sys.argv[1:]
+        _keep_compiled_programs()
     if arguments in (["--help"], ["-h"], ["demos", "--help"], ["demos", "-h"]):
         print(_usage())
         return

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -201,28 +202,29 @@ class _Programs:
     """The compiled programs of one experiment, mapped over seeds."""
 
     def __init__(self, env: RecordableEnvironment, config: TrainConfig, demonstrations: Episodes, key_init: jax.Array):
-        static = dict(env=env, config=config)
-        self.guidance = jax.jit(jax.vmap(functools.partial(training.guidance, **static)))(demonstrations)
-        self.state = jax.jit(jax.vmap(functools.partial(training.init, **static)))(key_init, self.guidance)
+        def program(function: Callable[..., Any], **static: Any) -> Callable[..., Any]:
+            return jax.vmap(functools.partial(function, env=env, config=config, **static))
 
-        per_step = 1 if config.algo == "bc" else config.num_envs
-        iterations = max(1, config.eval_every // per_step // CHUNKS_PER_EVALUATION)
-        program = training.clone if config.algo == "bc" else training.learn
-        self.learn = self._compile(functools.partial(program, num_iterations=iterations, **static), self.state)
-        if config.algo != "bc":
-            iterations = -(-config.learning_starts // config.num_envs)
-            self.collect = self._compile(functools.partial(training.collect, num_iterations=iterations, **static), self.state)
-
-        def evaluation(num_episodes: int) -> Any:
-            program = functools.partial(training.evaluate, num_episodes=num_episodes, **static)
-            mapped = jax.jit(jax.vmap(program))
-            return mapped.lower(key_init, self.state.agent.average_actor, self.guidance).compile()
-
-        self.evaluate = evaluation(config.eval_episodes)
-        self.evaluate_fresh = self.evaluate if config.eval_episodes == FRESH_EPISODES else evaluation(FRESH_EPISODES)
-
-    def _compile(self, program: Callable[..., Any], state: TrainState) -> Any:
-        return jax.jit(jax.vmap(program), donate_argnums=0).lower(state, self.guidance).compile()
+        self.guidance = jax.jit(program(training.guidance))(demonstrations)
+        self.state = jax.jit(program(training.init))(key_init, self.guidance)
+        cloning = config.algo == "bc"
+        chunk = max(1, config.eval_every // (1 if cloning else config.num_envs) // CHUNKS_PER_EVALUATION)
+        state, policy = (self.state, self.guidance), (key_init, self.state.agent.average_actor, self.guidance)
+        learn = program(training.clone if cloning else training.learn, num_iterations=chunk)
+        collect = program(training.collect, num_iterations=-(-config.learning_starts // config.num_envs))
+        lowered = {
+            "learn": jax.jit(learn, donate_argnums=0).lower(*state),
+            "evaluate": jax.jit(program(training.evaluate, num_episodes=config.eval_episodes)).lower(*policy),
+        }
+        if not cloning:
+            lowered["collect"] = jax.jit(collect, donate_argnums=0).lower(*state)
+        if config.eval_episodes != FRESH_EPISODES:
+            lowered["evaluate_fresh"] = jax.jit(program(training.evaluate, num_episodes=FRESH_EPISODES)).lower(*policy)
+        # Compilation leaves most of a core idle, so the programs are compiled side by side.
+        with ThreadPoolExecutor() as pool:
+            compiled = dict(zip(lowered, pool.map(lambda program: program.compile(), lowered.values()), strict=True))
+        self.learn, self.evaluate, self.collect = compiled["learn"], compiled["evaluate"], compiled.get("collect")
+        self.evaluate_fresh = compiled.get("evaluate_fresh", self.evaluate)
 
 
 def _split_all(keys: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -58,7 +58,7 @@ BAD = [
     (BatchConfig, "batch_size", [0, 1.5, True, "512"]),
     (BatchConfig, "max_demo_ratio", [-0.1, 1.1, float("nan"), None, 1.0]),  # 1.0 leaves no replay row
     (BatchConfig, "reach_zero", [0, -5, 0.5]),
-    (BatchConfig, "num_sampled_goals", [-1, 4.0]),
+    (BatchConfig, "num_sampled_goals", [-1, "4", float("inf")]),
     (BatchConfig, "hindrl_sampling_strategy", ["joint_intersection", "Future", None]),
     (BatchConfig, "union_sampling_ratio", [-0.1, 1.5]),
     (BatchConfig, "n_step", [0, None]),
@@ -78,7 +78,7 @@ BAD = [
     (AgentConfig, "learning_rate", [0.0, -1e-3, float("inf"), "1e-3"]),
     (AgentConfig, "num_critics", [0]),
     (AgentConfig, "num_quantiles", [0]),
-    (AgentConfig, "top_quantiles_to_drop_per_net", [-1, 25]),
+    (AgentConfig, "top_quantiles_to_drop_per_net", [-1, AgentConfig().num_quantiles]),
     (AgentConfig, "target_update_rate", [0.0, 1.1]),
     (AgentConfig, "actor_average_rate", [0.0, 1.1]),
     (AgentConfig, "initial_alpha", [0.0]),
@@ -87,15 +87,13 @@ BAD = [
     (AgentConfig, "bc_weight", [-1.0]),
     (AgentConfig, "bc_loss", ["l2"]),
     (AgentConfig, "bc_action", ["mode"]),
-    (AgentConfig, "action_l2", [-1.0, float("nan")]),
     (AgentConfig, "input_encoding", ["scaled"]),
     (AgentConfig, "policy_input", ["observation"]),
     (TrainConfig, "algo", ["HinDRL", "sac"]),
-    (TrainConfig, "steps", [0, 1_600, 1e5]),  # 1600 is the default of learning_starts
+    (TrainConfig, "steps", [0, TrainConfig().learning_starts, 1e5]),  # the run would end before learning begins
     (TrainConfig, "num_envs", [0]),
-    (TrainConfig, "random_action_probability", [-0.1, 1.1]),
     (TrainConfig, "updates_per_iteration", [0]),
-    (TrainConfig, "learning_starts", [-1, 300_000]),
+    (TrainConfig, "learning_starts", [-1, TrainConfig().steps]),
     (TrainConfig, "buffer_size", [0, 1e6]),
     (TrainConfig, "eval_every", [0]),
     (TrainConfig, "eval_episodes", [0]),
@@ -118,8 +116,8 @@ def test_the_table_of_bad_values_is_complete():
 @pytest.mark.parametrize(
     "build",
     [
-        lambda: BatchConfig(max_demo_ratio=0, gamma=1, reach_zero=None, num_sampled_goals=0),  # an int serves as a float
-        lambda: AgentConfig(top_quantiles_to_drop_per_net=24, target_entropy=-3.0, bc_weight=0, net_arch=(1,)),
+        lambda: BatchConfig(max_demo_ratio=0, gamma=1, reach_zero=None, num_sampled_goals=0.5),  # an int serves as a float
+        lambda: AgentConfig(num_quantiles=25, top_quantiles_to_drop_per_net=24, target_entropy=-3.0, bc_weight=0, net_arch=(1,)),
         lambda: TrainConfig(algo="bc", steps=1, learning_starts=5),  # cloning takes no environment steps
     ],
 )

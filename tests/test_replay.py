@@ -263,11 +263,15 @@ def test_jitted_equals_not_jitted():
 
 
 @pytest.mark.parametrize(
-    ("size", "demo", "relabelled", "original"),
-    [(4096, 409, 2949, 738), (12_000, 1200, 8640, 2160)],  # the thesis's two batches, with r = 0.1 and n = 4
+    ("size", "num_sampled_goals", "demo", "relabelled", "original"),
+    [
+        (4096, 4, 409, 2949, 738),  # the thesis's two batches, with r = 0.1 and n = 4
+        (12_000, 4, 1200, 8640, 2160),
+        (4096, 0.5, 409, 1229, 2458),  # one relabelled row for two others: 3687 / 3
+    ],
 )
-def test_composition_of_the_batch(size, demo, relabelled, original):
-    config = BatchConfig(batch_size=size, max_demo_ratio=0.1, num_sampled_goals=4, hindrl_sampling_strategy="future", n_step=1)
+def test_composition_of_the_batch(size, num_sampled_goals, demo, relabelled, original):
+    config = BatchConfig(batch_size=size, max_demo_ratio=0.1, num_sampled_goals=num_sampled_goals, hindrl_sampling_strategy="future", n_step=1)
     history, _ = replay_history([[3], [2]])
     batch = draw_batch(jax.random.key(0), at(history, 20), num_demo_rows(jnp.asarray(0), config), config)
     assert config.max_demo_rows == demo

@@ -1,0 +1,25 @@
+"""Learning from beginning to end. Minutes each: `make test-slow`."""
+
+import numpy as np
+import pytest
+
+import hindrl_jax as hindrl
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.parametrize("algo", ["tqcfd", "hindrl", "smooth-hindrl"])
+def test_one_demonstration_solves_the_fixed_grid(algo):
+    env = hindrl.make("FixedGridPickAndPlace")
+    seeds = [7001, 7002]
+    demonstrations = [hindrl.record_demonstrations(env, 1, seed=seed).episodes for seed in seeds]
+    result = hindrl.fit(env, demonstrations, hindrl.preset(algo), seeds=seeds)
+    assert (result.final_success >= 0.95).all(), result.final_success
+    assert (result.final_length <= 46).all(), result.final_length  # the best possible is 41.5, the expert's 54.5
+    assert all(np.isfinite(value) for row in result.rows for value in row.metrics.values())
+
+
+def test_cloning_needs_many_demonstrations():
+    env = hindrl.make("FixedGridPickAndPlace")
+    few, many = (hindrl.fit(env, hindrl.record_demonstrations(env, count).episodes, hindrl.preset("bc")).final_success[0] for count in (1, 250))
+    assert few < 0.3 < many

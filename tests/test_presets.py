@@ -1,0 +1,95 @@
+"""Presets: the thesis's numbers as its appendix prints them, and the quirks of the original code."""
+
+import dataclasses
+
+import pytest
+
+from hindrl_jax.errors import UserError
+from hindrl_jax.presets import preset
+from hindrl_jax.runs import TrainConfig
+
+# Appendix A.1.1 of the thesis, row by row.
+APPENDIX = {
+    "batch_size": 4_096,
+    "learning_rate": 1e-3,
+    "net_arch": (64, 64, 64, 64),
+    "top_quantiles_to_drop_per_net": 2,
+    "buffer_size": 500_000,
+    "learning_starts": 10_000,
+    "bc_weight": 1.0,
+    "max_demo_ratio": 0.1,
+    "reach_zero": 500_000,
+    "hindrl_sampling_strategy": "task_conditioned",
+    "m": 0,
+    "k": 0.0,
+}
+# What its text leaves to its framework (Stable-Baselines3 with sb3-contrib's TQC).
+FRAMEWORK = {
+    "gamma": 0.99,
+    "target_update_rate": 0.005,
+    "initial_alpha": 1.0,
+    "target_entropy": None,
+    "final_target_entropy": None,
+    "num_critics": 2,
+    "num_quantiles": 25,
+    "num_envs": 1,
+    "updates_per_iteration": 1,
+    "n_step": 1,
+    "terminate_on_relabel": False,
+    "layer_norm": False,
+    "input_encoding": "raw",
+    "actor_average_rate": 1.0,
+    "policy_input": "achieved_desired_observation",
+    "inclusive_goal_test": True,
+    "bc_loss": "squared",
+    "bc_action": "mean",
+    "behavioural_goals": "final_demonstration_states",
+}
+
+
+def flat(config: TrainConfig) -> dict:
+    values = {}
+    for name, value in dataclasses.asdict(config).items():
+        values.update(value if isinstance(value, dict) else {name: value})
+    return values
+
+
+@pytest.mark.parametrize(("algo", "relabelled", "filtered"), [("tqcfd", 0, False), ("hindrl", 4, False), ("smooth-hindrl", 4, True)])
+def test_thesis_preset_is_the_appendix(algo, relabelled, filtered):
+    values = flat(preset(algo, "thesis"))
+    expected = APPENDIX | FRAMEWORK | {"algo": algo, "num_sampled_goals": relabelled, "epsilon_filtering": filtered}
+    assert {name: values[name] for name in expected} == expected
+
+
+def test_thesis_bc_is_the_appendix():
+    values = flat(preset("bc", "thesis"))
+    assert (values["batch_size"], values["learning_rate"], values["net_arch"]) == (2_048, 1e-3, (32, 32))
+
+
+def test_original_preset_differs_from_the_thesis_by_the_quirks_alone():
+    thesis, original = flat(preset("hindrl", "thesis")), flat(preset("hindrl", "original"))
+    assert {name: original[name] for name in original if original[name] != thesis[name]} == {
+        "inclusive_goal_test": False,
+        "timeouts_are_terminal": True,
+        "behavioural_goals": "task",
+        "exclude_last_goal": True,
+        "rescale_demo_actions": False,
+        "bc_loss": "norm",
+        "bc_action": "sample",
+    }
+
+
+def test_field_names_are_unique_across_the_nested_configs():
+    """So that each can be a flag of its own."""
+    config = preset()
+    assert len(flat(config)) == sum(
+        len(dataclasses.fields(getattr(config, field.name))) if dataclasses.is_dataclass(getattr(config, field.name)) else 1
+        for field in dataclasses.fields(config)
+    )
+
+
+def test_unknown_names_are_refused():
+    with pytest.raises(UserError, match="did you mean 'hindrl'"):
+        preset("hindlr")
+    with pytest.raises(UserError, match="unknown preset"):
+        preset("hindrl", "paper")
