@@ -36,8 +36,7 @@ class AgentState:
     alpha_optimiser: optax.OptState
 
 
-def _optimiser(config: AgentConfig) -> optax.GradientTransformation:
-    return optax.adam(config.learning_rate)
+_ADAM = optax.scale_by_adam()  # the step size is applied apart, since it may change along a run
 
 
 @struct.dataclass(kw_only=True)
@@ -48,17 +47,17 @@ class InputScale:
     goal: Array  # (G,) > 0
 
 
-def input_scale(observations: Array, achieved_goals: Array, weights: Array) -> InputScale:
+def input_scale(observations: Array, achieved_goals: Array, is_visited: Array) -> InputScale:
     """Root mean square of each dimension over demonstration states; 1 where a dimension is always zero.
 
     Args:
       observations, achieved_goals: (..., D) and (..., G).
-      weights: (...) 1 for states that count, 0 for padding.
+      is_visited: (...) bool, false for padding.
     """
 
     def rms(values: Array) -> Array:
         axes = tuple(range(values.ndim - 1))
-        mean_square = jnp.sum(jnp.square(values) * weights[..., None], axis=axes) / jnp.sum(weights)
+        mean_square = jnp.sum(jnp.where(is_visited[..., None], jnp.square(values), 0.0), axis=axes) / jnp.sum(is_visited)
         return jnp.where(mean_square > 0.0, jnp.sqrt(mean_square), 1.0)
 
     return InputScale(observation=rms(observations), goal=rms(achieved_goals))
@@ -95,16 +94,15 @@ def init(key: Array, config: AgentConfig, *, observation_dim: int, goal_dim: int
     actor = init_actor(key_actor, config, input_dim=input_dim, action_dim=action_dim)
     critics = init_critics(key_critics, config, input_dim=input_dim, action_dim=action_dim)
     log_alpha = jnp.log(jnp.asarray(config.initial_alpha, jnp.float32))
-    optimiser = _optimiser(config)
     return AgentState(
         actor=actor,
         average_actor=jax.tree.map(jnp.copy, actor),
         critics=critics,
         target_critics=jax.tree.map(jnp.copy, critics),
         log_alpha=log_alpha,
-        actor_optimiser=optimiser.init(actor),
-        critic_optimiser=optimiser.init(critics),
-        alpha_optimiser=optimiser.init(log_alpha),
+        actor_optimiser=_ADAM.init(actor),
+        critic_optimiser=_ADAM.init(critics),
+        alpha_optimiser=_ADAM.init(log_alpha),
     )
 
 
@@ -113,20 +111,34 @@ def policy(actor: Params, inputs: Array, config: AgentConfig, *, action_dim: int
     return apply_actor(actor, inputs, config, action_dim=action_dim)
 
 
-def target_entropy(progress: Array | float, config: AgentConfig, *, action_dim: int) -> Array | float:
-    """The entropy aimed at, in nats, when a share `progress` in [0, 1] of the run is over."""
-    start = -float(action_dim) if config.target_entropy is None else config.target_entropy
-    end = start if config.final_target_entropy is None else config.final_target_entropy
-    return start + (end - start) * progress
+@struct.dataclass(kw_only=True)
+class Schedule:
+    """What changes along a run."""
+
+    learning_rate: Array | float  # () step size of Adam
+    target_entropy: Array | float  # () in nats
 
 
-def _descend(gradient: Any, optimiser_state: optax.OptState, params: Any, config: AgentConfig) -> tuple[Any, optax.OptState]:
-    updates, optimiser_state = _optimiser(config).update(gradient, optimiser_state, params)
-    return optax.apply_updates(params, updates), optimiser_state
+def schedule(progress: Array | float, config: AgentConfig, *, action_dim: int) -> Schedule:
+    """The schedule when a share `progress` in [0, 1] of the run is over; both values move linearly."""
+
+    def between(start: float, end: float | None) -> Array | float:
+        return start if end is None else start + (end - start) * progress
+
+    entropy = -float(action_dim) if config.target_entropy is None else config.target_entropy
+    return Schedule(
+        learning_rate=between(config.learning_rate, config.final_learning_rate),
+        target_entropy=between(entropy, config.final_target_entropy),
+    )
+
+
+def _descend(gradient: Any, optimiser_state: optax.OptState, params: Any, learning_rate: Array | float) -> tuple[Any, optax.OptState]:
+    updates, optimiser_state = _ADAM.update(gradient, optimiser_state, params)
+    return jax.tree.map(lambda param, update: param - learning_rate * update, params, updates), optimiser_state
 
 
 def update(
-    key: Array, state: AgentState, batch: Transition, *, inputs: Array, next_inputs: Array, target_entropy: Array | float, config: AgentConfig
+    key: Array, state: AgentState, batch: Transition, *, inputs: Array, next_inputs: Array, schedule: Schedule, config: AgentConfig
 ) -> tuple[AgentState, Metrics]:
     """One gradient step of entropy coefficient, critics and actor, then of the target critics.
 
@@ -138,7 +150,7 @@ def update(
       state: the agent.
       batch: B transitions.
       inputs, next_inputs: (B, input_dim) network inputs at the two ends of the transitions, see `network_inputs`.
-      target_entropy: () see `target_entropy`.
+      schedule: see `schedule`.
       config: static.
 
     Returns:
@@ -163,7 +175,7 @@ def update(
         return jnp.mean(quantile_huber(quantiles, targets)), jnp.mean(quantiles)
 
     (loss_critic, value), gradient = jax.value_and_grad(critic_loss, has_aux=True)(state.critics)
-    critics, critic_optimiser = _descend(gradient, state.critic_optimiser, state.critics, config)
+    critics, critic_optimiser = _descend(gradient, state.critic_optimiser, state.critics, schedule.learning_rate)
 
     def actor_loss(actor: Params) -> tuple[Array, tuple[Array, Array, Array]]:
         distribution = policy(actor, inputs, config, action_dim=action_dim)
@@ -174,10 +186,10 @@ def update(
         return jnp.mean(alpha * log_prob - value) + config.bc_weight * bc, (log_prob, bc, jnp.mean(value))
 
     (loss_actor, (log_prob, bc, policy_value)), gradient = jax.value_and_grad(actor_loss, has_aux=True)(state.actor)
-    actor, actor_optimiser = _descend(gradient, state.actor_optimiser, state.actor, config)
+    actor, actor_optimiser = _descend(gradient, state.actor_optimiser, state.actor, schedule.learning_rate)
 
-    loss_alpha, gradient = jax.value_and_grad(entropy_coefficient)(state.log_alpha, log_prob, target_entropy=target_entropy)
-    log_alpha, alpha_optimiser = _descend(gradient, state.alpha_optimiser, state.log_alpha, config)
+    loss_alpha, gradient = jax.value_and_grad(entropy_coefficient)(state.log_alpha, log_prob, target_entropy=schedule.target_entropy)
+    log_alpha, alpha_optimiser = _descend(gradient, state.alpha_optimiser, state.log_alpha, schedule.learning_rate)
 
     new_state = AgentState(
         actor=actor,
@@ -222,6 +234,6 @@ def update_bc(state: AgentState, batch: Transition, *, inputs: Array, config: Ag
         return jnp.mean(jnp.square(action - batch.action))
 
     value, gradient = jax.value_and_grad(loss)(state.actor)
-    actor, actor_optimiser = _descend(gradient, state.actor_optimiser, state.actor, config)
+    actor, actor_optimiser = _descend(gradient, state.actor_optimiser, state.actor, config.learning_rate)
     average_actor = optax.incremental_update(actor, state.average_actor, config.actor_average_rate)
     return state.replace(actor=actor, average_actor=average_actor, actor_optimiser=actor_optimiser), {"actor/bc_loss": value}

@@ -142,6 +142,8 @@ class AgentConfig:
     """Layer normalisation before each activation of the critics."""
     learning_rate: float = 1e-3
     """Adam's step size, for actor, critics and entropy coefficient."""
+    final_learning_rate: float | None = 1e-4
+    """Where the step size has moved, linearly, by the end of the run; None keeps it constant."""
     num_critics: int = 2
     """Number of quantile critics."""
     num_quantiles: int = 25
@@ -175,6 +177,7 @@ class AgentConfig:
             self,
             net_arch=(len(self.net_arch) >= 1 and all(width >= 1 for width in self.net_arch), "one or more widths, each at least 1"),
             learning_rate=(self.learning_rate > 0.0, "greater than 0"),
+            final_learning_rate=(self.final_learning_rate is None or self.final_learning_rate >= 0.0, "0 or more, or None"),
             num_critics=(self.num_critics >= 1, "at least 1"),
             num_quantiles=(self.num_quantiles >= 1, "at least 1"),
             top_quantiles_to_drop_per_net=(

@@ -16,6 +16,7 @@ import numpy as np
 from experts.recording import RecordableEnvironment, Recording, record
 from hindrl_jax import train as training
 from hindrl_jax.config import TrainConfig
+from hindrl_jax.errors import UserError
 from hindrl_jax.registry import task
 from hindrl_jax.train import Guidance, TrainState
 from hindrl_jax.types import Episodes
@@ -23,6 +24,7 @@ from hindrl_jax.types import Episodes
 SOLVED = 0.95
 FRESH_EPISODES = 100
 CHUNKS_PER_EVALUATION = 10
+_RUN_ONCE = {"xla_backend_optimization_level": 0}  # for programs whose compilation takes longer than their one run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,6 +154,8 @@ def fit(
     """
     shared = isinstance(demonstrations, Episodes)
     demonstrations = jax.tree.map(lambda *leaves: jnp.stack(leaves), *([demonstrations] * len(seeds) if shared else demonstrations))
+    if config.goal.misalign_demo_actions and int(demonstrations.lengths.min()) < 2:
+        raise UserError("misalign_demo_actions needs demonstrations of at least 2 steps: turn it off or record others")
     keys = jax.vmap(lambda seed: jax.random.split(jax.random.key(seed)))(jnp.asarray(seeds, jnp.uint32))
     key_init, key_eval = keys[:, 0], keys[:, 1]
 
@@ -206,7 +210,8 @@ class _Programs:
             return jax.vmap(functools.partial(function, env=env, config=config, **static))
 
         self.guidance = jax.jit(program(training.guidance))(demonstrations)
-        self.state = jax.jit(program(training.init))(key_init, self.guidance)
+        init = jax.jit(program(training.init)).lower(key_init, self.guidance).compile(_RUN_ONCE)
+        self.state = init(key_init, self.guidance)
         cloning = config.algo == "bc"
         chunk = max(1, config.eval_every // (1 if cloning else config.num_envs) // CHUNKS_PER_EVALUATION)
         state, policy = (self.state, self.guidance), (key_init, self.state.agent.average_actor, self.guidance)
@@ -222,7 +227,9 @@ class _Programs:
             lowered["evaluate_fresh"] = jax.jit(program(training.evaluate, num_episodes=FRESH_EPISODES)).lower(*policy)
         # Compilation leaves most of a core idle, so the programs are compiled side by side.
         with ThreadPoolExecutor() as pool:
-            compiled = dict(zip(lowered, pool.map(lambda program: program.compile(), lowered.values()), strict=True))
+            compiled = dict(
+                zip(lowered, pool.map(lambda name: lowered[name].compile(_RUN_ONCE if name == "collect" else None), lowered), strict=True)
+            )
         self.learn, self.evaluate, self.collect = compiled["learn"], compiled["evaluate"], compiled.get("collect")
         self.evaluate_fresh = compiled.get("evaluate_fresh", self.evaluate)
 

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from hindrl_jax.randomness import uniform_index
 from hindrl_jax.types import Array
 
 
@@ -140,4 +141,4 @@ def constant_goal(goal: Array) -> GoalTable:
 
 def sample_goals(key: Array, table: GoalTable, num_goals: int) -> Array:
     """Draws goals uniformly, with replacement, from the table (thesis eq. 4.2): (num_goals, G)."""
-    return table.goals[jax.random.randint(key, (num_goals,), 0, table.count)]
+    return table.goals[uniform_index(key, (num_goals,), table.count)]

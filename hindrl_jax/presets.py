@@ -89,6 +89,7 @@ def _thesis(algo: Algorithm) -> TrainConfig:
             net_arch=(64, 64, 64, 64),
             layer_norm=False,
             learning_rate=1e-3,
+            final_learning_rate=None,
             top_quantiles_to_drop_per_net=2,
             target_update_rate=0.005,
             initial_alpha=1.0,

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 
 from hindrl_jax.config import Strategy
 from hindrl_jax.goals import GoalTable, sample_goals
+from hindrl_jax.randomness import uniform_index
 from hindrl_jax.types import Array
 
 
@@ -37,7 +38,7 @@ def hindsight_steps(key: Array, steps: Array, lengths: Array, *, strategy: Liter
     if strategy == "final":
         return lengths
     first = steps + 1 if strategy == "future" else jnp.zeros_like(steps)
-    return jax.random.randint(key, steps.shape, first, lengths + 1)
+    return first + uniform_index(key, steps.shape, lengths + 1 - first)
 
 
 def relabelled_goals(

@@ -18,6 +18,7 @@ from flax import struct
 from hindrl_jax.config import BatchConfig
 from hindrl_jax.errors import UserError
 from hindrl_jax.goals import GoalTable, goal_reached
+from hindrl_jax.randomness import uniform_index
 from hindrl_jax.relabel import hindsight_steps, relabelled_goals
 from hindrl_jax.types import Array, Episodes, Transition
 
@@ -26,7 +27,7 @@ from hindrl_jax.types import Array, Episodes, Transition
 class ReplayState:
     """Rings of episodes, one ring of R slots for each of the E environments; slot r of environment e is row e * R + r of `episodes`."""
 
-    episodes: Episodes  # E * R episodes; the length of an incomplete or empty one is 0
+    episodes: Episodes  # E * R episodes; what lies in a slot that is empty or being written is never sampled
     slot: Array  # (E,) int32, the slot that each environment is writing
     step: Array  # (E,) int32, transitions already written there
     num_complete: Array  # (E,) int32, complete episodes in each ring, at most R - 1
@@ -117,7 +118,7 @@ def sample_episodes(key: Array, replay: ReplayState, num_samples: int) -> Array:
     """
     slots = replay.episodes.lengths.shape[0] // replay.slot.shape[0]
     cumulative = jnp.cumsum(replay.num_complete)
-    drawn = jax.random.randint(key, (num_samples,), 0, jnp.maximum(cumulative[-1], 1))
+    drawn = uniform_index(key, (num_samples,), jnp.maximum(cumulative[-1], 1))
     env = jnp.searchsorted(cumulative, drawn, side="right", method="compare_all")
     age = cumulative[env] - drawn  # 1 for the newest episode of that environment
     return env * slots + (replay.slot[env] - age) % slots
@@ -125,7 +126,7 @@ def sample_episodes(key: Array, replay: ReplayState, num_samples: int) -> Array:
 
 def sample_steps(key: Array, episodes: Episodes, rows: Array) -> Array:
     """Draws a transition uniformly from each of the given episodes: rows (B,) -> steps (B,) int32, 0 <= step < length."""
-    return jax.random.randint(key, rows.shape, 0, jnp.maximum(episodes.lengths[rows], 1))
+    return uniform_index(key, rows.shape, jnp.maximum(episodes.lengths[rows], 1))
 
 
 def transitions(
@@ -248,7 +249,7 @@ def sample_batch(
     if config.max_demo_rows == 0:
         return batch
 
-    demo = jax.random.randint(key_demo, (config.max_demo_rows,), 0, num_demos)
+    demo = uniform_index(key_demo, (config.max_demo_rows,), num_demos)
     demo_batch = transitions(
         demonstrations,
         demo,

@@ -1,7 +1,7 @@
 """Training as pure functions over one state: collect, learn (or clone), evaluate. The Python loop over jitted chunks is the caller's.
 
-The chain relabel -> batch -> update is one program. Batches are drawn before the scan over the gradient steps of an iteration, never inside
-it: XLA would copy a replay that is written outside a nested loop and read within it.
+The chain relabel -> batch -> update is one program. The batches of an iteration are drawn together, in one read of the replay, before the scan
+over its gradient steps.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from hindrl_jax.agent import AgentState, InputScale, Metrics
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.errors import UserError
 from hindrl_jax.goals import GoalTable
+from hindrl_jax.randomness import uniform_index
 from hindrl_jax.replay import ReplayState
 from hindrl_jax.rollout import Act, Evaluation, RolloutState
 from hindrl_jax.types import Array, Environment, Episodes, Transition, action_to_env
@@ -180,13 +181,13 @@ def learn(state: TrainState, data: Guidance, *, env: Environment, config: TrainC
         num_updates = config.updates_per_iteration
         batches = jax.vmap(draw)(jax.random.split(key_batch, num_updates))
         progress = jnp.minimum(state.env_steps / config.steps, 1.0)
-        entropy = agents.target_entropy(progress, config.agent, action_dim=env.action_dim)
+        schedule = agents.schedule(progress, config.agent, action_dim=env.action_dim)
 
         def gradient_step(carry: tuple[Array, AgentState], batch: Transition) -> tuple[tuple[Array, AgentState], Metrics]:
             key, agent = carry
             key, key_update = jax.random.split(key)
             inputs = _network_inputs(batch, data.scale, env, config)
-            agent, metrics = agents.update(key_update, agent, batch, **inputs, target_entropy=entropy, config=config.agent)
+            agent, metrics = agents.update(key_update, agent, batch, **inputs, schedule=schedule, config=config.agent)
             return (key, agent), metrics
 
         (_, agent), metrics = jax.lax.scan(gradient_step, (key_updates, state.agent), batches)
@@ -202,7 +203,7 @@ def clone(state: TrainState, data: Guidance, *, env: Environment, config: TrainC
 
     def gradient_step(state: TrainState, _: None) -> tuple[TrainState, Metrics]:
         key, key_demo, key_step = jax.random.split(state.key, 3)
-        rows = jax.random.randint(key_demo, (size,), 0, num_demos)
+        rows = uniform_index(key_demo, (size,), num_demos)
         batch = replay.transitions(
             data.demonstrations,
             rows,

@@ -25,6 +25,7 @@ CONFIG = AgentConfig(
     initial_alpha=1e-4,
     target_entropy=-50.0,
     final_target_entropy=None,
+    final_learning_rate=None,
     bc_weight=0.0,
     input_encoding="raw",
 )
@@ -69,7 +70,7 @@ def updates(key, start, batch, config):
     given = dict(
         inputs=inputs_of(batch.observation, config),
         next_inputs=inputs_of(batch.next_observation, config),
-        target_entropy=agents.target_entropy(0.0, config, action_dim=1),
+        schedule=agents.schedule(0.0, config, action_dim=1),
     )
 
     def step(state, key):
@@ -206,7 +207,7 @@ def test_entropy_bonus_enters_the_target():
 )
 def test_target_entropy_by_hand(start, end, entropies):
     config = AgentConfig(target_entropy=start, final_target_entropy=end)
-    assert [agents.target_entropy(progress, config, action_dim=3) for progress in (0.0, 0.25, 1.0)] == entropies
+    assert [agents.schedule(progress, config, action_dim=3).target_entropy for progress in (0.0, 0.25, 1.0)] == entropies
 
 
 def test_target_critics_and_average_actor_move_by_their_rates():
@@ -280,3 +281,10 @@ def test_update_bc_overfits_a_tiny_batch_and_touches_only_the_actor():
     assert np.abs(end.average_actor["params"]["Dense_0"]["kernel"] - start.actor["params"]["Dense_0"]["kernel"]).max() > 0.1
     for name in ("critics", "target_critics", "log_alpha", "critic_optimiser", "alpha_optimiser"):
         chex.assert_trees_all_equal(getattr(start, name), getattr(end, name))
+
+
+def test_learning_rate_moves_linearly_or_not_at_all():
+    moving = AgentConfig(learning_rate=1e-3, final_learning_rate=1e-4)
+    assert np.allclose([agents.schedule(progress, moving, action_dim=1).learning_rate for progress in (0.0, 0.5, 1.0)], [1e-3, 5.5e-4, 1e-4])
+    constant = AgentConfig(learning_rate=1e-3, final_learning_rate=None)
+    assert [agents.schedule(progress, constant, action_dim=1).learning_rate for progress in (0.0, 1.0)] == [1e-3, 1e-3]

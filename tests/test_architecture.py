@@ -14,14 +14,15 @@ CORE = {
     "errors": set(),
     "types": set(),
     "config": {"types"},
-    "goals": {"types", "config"},
-    "relabel": {"types", "config", "goals"},
-    "replay": {"errors", "types", "config", "goals", "relabel"},
+    "randomness": {"types"},
+    "goals": {"types", "config", "randomness"},
+    "relabel": {"types", "config", "randomness", "goals"},
+    "replay": {"errors", "types", "config", "randomness", "goals", "relabel"},
     "networks": {"types", "config"},
     "losses": {"types"},
     "agent": {"types", "config", "networks", "losses"},
     "rollout": {"types", "config", "goals"},
-    "train": {"errors", "types", "config", "goals", "relabel", "replay", "networks", "losses", "agent", "rollout"},
+    "train": {"errors", "types", "config", "randomness", "goals", "relabel", "replay", "networks", "losses", "agent", "rollout"},
 }
 ENVS = sorted(path for path in (ROOT / "envs").rglob("*.py") if path.stem != "viewer")
 VIEWERS = sorted((ROOT / "envs").rglob("viewer.py"))

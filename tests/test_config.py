@@ -82,6 +82,7 @@ BAD = [
     (AgentConfig, "target_update_rate", [0.0, 1.1]),
     (AgentConfig, "actor_average_rate", [0.0, 1.1]),
     (AgentConfig, "initial_alpha", [0.0]),
+    (AgentConfig, "final_learning_rate", [float("nan"), -1.0]),
     (AgentConfig, "target_entropy", [float("nan"), "auto"]),
     (AgentConfig, "final_target_entropy", [float("nan")]),
     (AgentConfig, "bc_weight", [-1.0]),

@@ -29,6 +29,7 @@ FRAMEWORK = {
     "target_update_rate": 0.005,
     "initial_alpha": 1.0,
     "target_entropy": None,
+    "final_learning_rate": None,
     "final_target_entropy": None,
     "num_critics": 2,
     "num_quantiles": 25,
