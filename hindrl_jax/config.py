@@ -142,7 +142,7 @@ class AgentConfig:
     """Layer normalisation before each activation of the critics."""
     learning_rate: float = 1e-3
     """Adam's step size, for actor, critics and entropy coefficient."""
-    final_learning_rate: float | None = 1e-4
+    final_learning_rate: float | None = None
     """Where the step size has moved, linearly, by the end of the run; None keeps it constant."""
     num_critics: int = 2
     """Number of quantile critics."""
@@ -152,7 +152,7 @@ class AgentConfig:
     """Largest target quantiles dropped per critic (TQC's truncation)."""
     target_update_rate: float = 0.02
     """Share of the online critics that moves into the target critics at each gradient step (Polyak averaging)."""
-    actor_average_rate: float = 0.005
+    actor_average_rate: float = 0.002
     """Share of the actor that moves into its running average at each gradient step; evaluations and the saved policy use the average."""
     initial_alpha: float = 0.002
     """Entropy coefficient at the start; it is tuned automatically from there."""
@@ -197,7 +197,7 @@ class TrainConfig:
 
     algo: Algorithm = "hindrl"
     """Which of the four models: bc, tqcfd (no relabelling), hindrl, smooth-hindrl."""
-    steps: int = 400_000
+    steps: int = 300_000
     """Environment steps of the run; for bc, which takes none, gradient steps."""
     num_envs: int = 64
     """Environments stepped side by side."""
