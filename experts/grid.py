@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from envs.grid.pick_and_place import FixedGridPickAndPlace, GridPickAndPlace, GridState
+from hindrl_jax.checks import check_types
 from hindrl_jax.types import Array
 
 
@@ -25,6 +26,7 @@ class GridExpert:
     """Move at random, instead of towards the next object, on the step that releases a delivered object (the original code)."""
 
     def __post_init__(self):
+        check_types(self)
         if not 0.0 <= self.random_action_probability <= 1.0:
             raise ValueError(f"random_action_probability must be in [0, 1], got {self.random_action_probability}.")
 

@@ -20,6 +20,9 @@ Expert = Any
 class RecordableEnvironment(Environment, Protocol):
     """An environment whose state can be written down as a vector, and read back to be drawn."""
 
+    @property
+    def state_dim(self) -> int: ...
+
     def state_to_vector(self, state: Any) -> Array: ...
 
     def vector_to_state(self, key: Array, vector: Array) -> Any: ...

@@ -216,13 +216,14 @@ def update(
     return new_state, metrics
 
 
-def update_bc(state: AgentState, batch: Transition, *, inputs: Array, config: AgentConfig) -> tuple[AgentState, Metrics]:
+def update_bc(state: AgentState, batch: Transition, *, inputs: Array, schedule: Schedule, config: AgentConfig) -> tuple[AgentState, Metrics]:
     """One gradient step of behaviour cloning alone: mean squared error of tanh(mean) to the demonstrated action (thesis eq. 4.1).
 
     Args:
       state: the agent; only the actor and its optimiser change.
       batch: B demonstration transitions.
       inputs: (B, input_dim) network inputs.
+      schedule: its learning rate is used.
       config: static.
 
     Returns:
@@ -234,6 +235,6 @@ def update_bc(state: AgentState, batch: Transition, *, inputs: Array, config: Ag
         return jnp.mean(jnp.square(action - batch.action))
 
     value, gradient = jax.value_and_grad(loss)(state.actor)
-    actor, actor_optimiser = _descend(gradient, state.actor_optimiser, state.actor, config.learning_rate)
+    actor, actor_optimiser = _descend(gradient, state.actor_optimiser, state.actor, schedule.learning_rate)
     average_actor = optax.incremental_update(actor, state.average_actor, config.actor_average_rate)
     return state.replace(actor=actor, average_actor=average_actor, actor_optimiser=actor_optimiser), {"actor/bc_loss": value}

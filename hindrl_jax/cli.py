@@ -30,9 +30,9 @@ from hindrl_jax.datasets import describe_demonstrations, load_demonstrations, re
 from hindrl_jax.errors import UserError
 from hindrl_jax.experiment import Result, fit, record_demonstrations
 from hindrl_jax.goals import epsilon_from_demonstrations, goal_table
-from hindrl_jax.presets import Preset, preset
+from hindrl_jax.presets import ORIGINAL_RULES, Preset, preset
 from hindrl_jax.registry import TASKS, did_you_mean, make, task
-from hindrl_jax.runs import RunSpec, RunWriter, draw_episode, load_run, read_spec
+from hindrl_jax.runs import FROM_PYTHON, RunSpec, RunWriter, draw_episode, load_run, read_spec
 from hindrl_jax.types import Episodes
 
 _TYRO = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
@@ -75,7 +75,7 @@ def _train(arguments: list[str]) -> None:
         bar = progress.add_task("compiling", total=spec.config.steps, rates="")
 
         def report(result: Result) -> None:
-            if result.steps_done == 0:
+            if not writer.started:
                 writer.start()
                 progress.console.print(f"compiled in {result.compile_seconds:.1f} s")
             new_rows = result.rows[writer.rows_written :]
@@ -113,7 +113,8 @@ def _parse_train(arguments: list[str]) -> tuple[RunSpec, TrainOptions]:
         spec = read_spec(Path(chosen["config"]))
     else:
         config = preset(chosen["algo"] or "hindrl", chosen["preset"] or "default")
-        spec = RunSpec(env=make(chosen["env"] or "FixedGridPickAndPlace"), config=config, demos="1", seeds=(0,))
+        env_arguments = ORIGINAL_RULES if chosen["preset"] == "original" else {}
+        spec = RunSpec(env=make(chosen["env"] or "FixedGridPickAndPlace", **env_arguments), config=config, demos="1", seeds=(0,))
 
     environment_class = type(spec.env)
     fields = [
@@ -133,13 +134,14 @@ def _parse_train(arguments: list[str]) -> tuple[RunSpec, TrainOptions]:
     options = parsed.options
     seeds = spec.seeds
     if options.seeds is not None or options.seed is not None:
-        count, first = (1 if options.seeds is None else options.seeds), (seeds[0] if options.seed is None else options.seed)
+        count, first = (len(seeds) if options.seeds is None else options.seeds), (seeds[0] if options.seed is None else options.seed)
         if count < 1:
             raise UserError(f"--seeds {count} is too few: train at least 1 seed")
         if not 0 <= first <= 2**32 - count:
             raise UserError(f"--seed {first} is not usable: choose a whole number from 0 to {2**32 - count}")
         seeds = tuple(range(first, first + count))
-    return RunSpec(env=parsed.environment, config=parsed.training, demos=options.demos, seeds=seeds), options
+    demos = options.demos if _is_number(options.demos) or options.demos == FROM_PYTHON else str(Path(options.demos).absolute())
+    return RunSpec(env=parsed.environment, config=parsed.training, demos=demos, seeds=seeds), options
 
 
 def _peek(arguments: Sequence[str], name: str) -> str | None:
@@ -155,9 +157,22 @@ def _peek(arguments: Sequence[str], name: str) -> str | None:
 
 def _demonstrations(spec: RunSpec) -> list[Episodes]:
     """One table of demonstrations per seed."""
-    if re.fullmatch(r"[+-]?\d+", spec.demos):
+    if spec.demos == FROM_PYTHON:
+        raise UserError("the demonstrations of this run were given from Python, not from a file: name others with --demos")
+    if _is_number(spec.demos):
         return [record_demonstrations(spec.env, int(spec.demos), seed=seed).episodes for seed in spec.seeds]
-    return [load_demonstrations(spec.demos, spec.env)] * len(spec.seeds)
+    episodes = load_demonstrations(spec.demos, spec.env)
+    solved = np.asarray(episodes.terminated)
+    if not solved.any():
+        raise UserError(f"{spec.demos}: none of its demonstrations solves the task, so there is no goal to learn: record others")
+    if not solved.all():
+        warnings.warn(f"{spec.demos}: dropped {(~solved).sum()} of {solved.size} demonstrations that do not solve the task", stacklevel=2)
+        episodes = jax.tree.map(lambda leaf: leaf[solved], episodes)
+    return [episodes] * len(spec.seeds)
+
+
+def _is_number(demos: str) -> bool:
+    return re.fullmatch(r"[+-]?\d+", demos) is not None
 
 
 def _evaluation_line(rows: Sequence[Any]) -> str:
@@ -225,7 +240,7 @@ class Render:
     directory: tyro.conf.Positional[Path]
     """Directory of the run."""
     to: Path | None = None
-    """A .gif file, or a .png file for the last state (default: DIRECTORY/episode.gif)."""
+    """A .gif file, or a .png file for the last state (default: in DIRECTORY, named after episode and seed)."""
     seed: int | None = None
     """Whose policy: one of the run's seeds (default: the first)."""
     episode: int = 0
@@ -237,8 +252,9 @@ class Render:
 def _render(arguments: list[str]) -> None:
     """Film an episode of a run's policy."""
     options = _parse(Render, arguments, "hindrl render")
-    path = options.to or options.directory / "episode.gif"
-    solved = load_run(options.directory).render(path, seed=options.seed, key=_key(options.episode), stochastic=options.stochastic)
+    run = load_run(options.directory)
+    path = options.to or options.directory / f"episode_{options.episode}_seed_{run.spec.seeds[0] if options.seed is None else options.seed}.gif"
+    solved = run.render(path, seed=options.seed, key=_key(options.episode), stochastic=options.stochastic)
     console.print(f"wrote {path}: the episode is {'solved' if solved else 'not solved'}")
 
 
@@ -324,8 +340,11 @@ def _demos_info(arguments: list[str]) -> None:
     console.print(f"{options.file}: {summary.env_name}({', '.join(f'{name}={value}' for name, value in summary.env_kwargs.items())})")
     console.print(
         f"{_count(summary.num_demonstrations, 'demonstration')}, {summary.num_solved} solved, {summary.num_transitions} transitions, "
-        f"lengths {summary.length_min} to {summary.length_max}, median {summary.length_median:g}"
+        f"lengths {summary.length_min} to {summary.length_max}, median {summary.length_median:g}, "
+        f"actions from {summary.action_low.min():g} to {summary.action_high.max():g}"
     )
+    if summary.expert:
+        console.print(f"expert: {', '.join(f'{name}={value}' for name, value in summary.expert.items())}")
     console.print(f"the filter keeps {int(filtered.count)} of {int(jnp.sum(lengths + 1))} goals (m = {options.m}, k = {options.k:g})")
     table = Table("goal dimension", "min", "max", "epsilon", box=box.SIMPLE_HEAD)
     reached = np.concatenate([np.asarray(achieved[i, : int(length) + 1]) for i, length in enumerate(lengths)])
@@ -446,10 +465,11 @@ def main(arguments: list[str] | None = None) -> None:
     if arguments in (["--help"], ["-h"], ["demos", "--help"], ["demos", "-h"]):
         print(_usage())
         return
-    warnings.showwarning = lambda message, *_, **__: print(f"hindrl: warning: {message}", file=sys.stderr)
     try:
-        command, rest = _find(arguments)
-        command(rest)
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_, **__: print(f"hindrl: warning: {message}", file=sys.stderr)
+            command, rest = _find(arguments)
+            command(rest)
     except UserError as error:
         print(f"hindrl: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2)

@@ -7,52 +7,13 @@ numbers and the original code's quirks are presets (`hindrl_jax.presets`).
 from __future__ import annotations
 
 import dataclasses
-import math
-from types import UnionType
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Literal
+
+from hindrl_jax.checks import check, check_types
 
 Algorithm = Literal["bc", "tqcfd", "hindrl", "smooth-hindrl"]
 Strategy = Literal["final", "future", "rollout_conditioned", "episode", "task_conditioned", "joint_union"]
 """Hindsight strategies, explained in `hindrl_jax.relabel`."""
-
-
-def _check_types(config: object) -> None:
-    """Raises ValueError naming the first field whose value is not of the type that its annotation asks for."""
-    for name, hint in get_type_hints(type(config)).items():
-        if not _matches(getattr(config, name), hint):
-            raise ValueError(f"{name} = {getattr(config, name)!r} is not usable: it must be {_in_words(hint)}")
-
-
-def _check(config: object, **conditions: tuple[bool, str]) -> None:
-    """Raises ValueError naming the first field whose condition does not hold, its value and what is asked of it."""
-    for name, (holds, requirement) in conditions.items():
-        if not holds:
-            raise ValueError(f"{name} = {getattr(config, name)!r} is not usable: it must be {requirement}")
-
-
-def _matches(value: object, hint: Any) -> bool:
-    """Whether a value is of the (simple) type that a field asks for; an int serves as a float, a bool as neither, NaN and infinity as nothing."""
-    origin, arguments = get_origin(hint), get_args(hint)
-    if origin is Literal:
-        return value in arguments
-    if origin is UnionType:
-        return any(_matches(value, argument) for argument in arguments)
-    if origin is tuple:
-        return isinstance(value, tuple) and all(_matches(item, arguments[0]) for item in value)
-    if hint is float:
-        return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-    return isinstance(value, hint) and (hint is bool or not isinstance(value, bool))
-
-
-def _in_words(hint: Any) -> str:
-    origin, arguments = get_origin(hint), get_args(hint)
-    if origin is Literal:
-        return f"one of {', '.join(map(str, arguments))}"
-    if origin is UnionType:
-        return " or ".join(_in_words(argument) for argument in arguments)
-    if origin is tuple:
-        return "a list of whole numbers"
-    return {int: "a whole number", float: "a finite number", bool: "true or false", type(None): "none"}.get(hint, f"a {hint.__name__}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,10 +44,10 @@ class BatchConfig:
     """Treat episodes cut by the horizon as terminated, as the original code does by mistake."""
 
     def __post_init__(self) -> None:
-        _check_types(self)
+        check_types(self)
         if self.hindrl_sampling_strategy == "rollout_conditioned":
             object.__setattr__(self, "hindrl_sampling_strategy", "future")
-        _check(
+        check(
             self,
             batch_size=(self.batch_size >= 1, "at least 1"),
             max_demo_ratio=(0.0 <= self.max_demo_ratio <= 1.0, "between 0 and 1"),
@@ -128,8 +89,8 @@ class GoalConfig:
     """Pair each demonstrated action with the observation after it, as the original code does for robot demonstrations."""
 
     def __post_init__(self) -> None:
-        _check_types(self)
-        _check(self, m=(self.m >= 0, "0 or more"), k=(self.k >= 0.0, "0 or more"))
+        check_types(self)
+        check(self, m=(self.m >= 0, "0 or more"), k=(self.k >= 0.0, "0 or more"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,8 +133,8 @@ class AgentConfig:
     """What the networks see; the second form repeats the achieved goal, as the thesis's framework does."""
 
     def __post_init__(self) -> None:
-        _check_types(self)
-        _check(
+        check_types(self)
+        check(
             self,
             net_arch=(len(self.net_arch) >= 1 and all(width >= 1 for width in self.net_arch), "one or more widths, each at least 1"),
             learning_rate=(self.learning_rate > 0.0, "greater than 0"),
@@ -198,13 +159,13 @@ class TrainConfig:
     algo: Algorithm = "hindrl"
     """Which of the four models: bc, tqcfd (no relabelling), hindrl, smooth-hindrl."""
     steps: int = 300_000
-    """Environment steps of the run; for bc, which takes none, gradient steps."""
+    """Environment steps of the run per seed, rounded up to a tenth of eval_every; for bc, which takes none, gradient steps."""
     num_envs: int = 64
     """Environments stepped side by side."""
     updates_per_iteration: int = 2
     """Gradient steps after each (vectorised) environment step."""
     learning_starts: int = 6_400
-    """Environment steps with uniformly random actions before the first gradient step."""
+    """Environment steps with uniformly random actions before the first gradient step; at least one horizon in each environment is taken."""
     buffer_size: int = 500_000
     """Transitions that the replay holds."""
     eval_every: int = 16_000
@@ -216,9 +177,9 @@ class TrainConfig:
     agent: AgentConfig = AgentConfig()
 
     def __post_init__(self) -> None:
-        _check_types(self)
+        check_types(self)
         counts = ("steps", "num_envs", "updates_per_iteration", "buffer_size", "eval_every", "eval_episodes")
-        _check(
+        check(
             self,
             **{name: (getattr(self, name) >= 1, "at least 1") for name in counts},
             learning_starts=(self.learning_starts >= 0, "0 or more"),
@@ -227,5 +188,3 @@ class TrainConfig:
             raise ValueError(f"tqcfd does not relabel, but num_sampled_goals = {self.batch.num_sampled_goals}: set it to 0, or choose hindrl")
         if self.algo == "smooth-hindrl" and not self.goal.epsilon_filtering:
             raise ValueError("smooth-hindrl is hindrl with epsilon_filtering, which is off: turn it on, or choose hindrl")
-        if self.algo != "bc" and self.steps <= self.learning_starts:
-            raise ValueError(f"steps = {self.steps} ends before learning begins: it must be greater than learning_starts = {self.learning_starts}")

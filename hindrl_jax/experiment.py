@@ -46,15 +46,19 @@ class Row:
 
 @dataclasses.dataclass(frozen=True)
 class SeedSummary:
-    """What became of one seed; None where the threshold of 95% was never reached."""
+    """What became of one seed. The threshold of 95% refers to the evaluations along the run; None where it was never reached."""
 
     seed: int
     final_success: float
+    """Share of 100 fresh episodes that the final policy solves."""
     best_success: float
+    """The best evaluation, the final one included."""
     env_steps_to_95: int | None
     updates_to_95: int | None
     seconds_to_95: float | None
+    """Wall-clock time of the whole run, all its seeds side by side."""
     episode_length: float
+    """Mean length of the 100 fresh episodes."""
 
 
 @dataclasses.dataclass
@@ -105,7 +109,7 @@ class Result:
         return SeedSummary(
             seed=seed,
             final_success=float(self.final_success[index]),
-            best_success=max(row.success for row in rows),
+            best_success=max(float(self.final_success[index]), *(row.success for row in rows)),
             env_steps_to_95=first and first.env_steps,
             updates_to_95=first and first.updates,
             seconds_to_95=first and first.seconds,
@@ -152,8 +156,7 @@ def fit(
     Raises:
       UserError: if the config does not fit the environment.
     """
-    shared = isinstance(demonstrations, Episodes)
-    demonstrations = jax.tree.map(lambda *leaves: jnp.stack(leaves), *([demonstrations] * len(seeds) if shared else demonstrations))
+    demonstrations = _demonstrations_per_seed(demonstrations, seeds, env)
     if config.goal.misalign_demo_actions and int(demonstrations.lengths.min()) < 2:
         raise UserError("misalign_demo_actions needs demonstrations of at least 2 steps: turn it off or record others")
     keys = jax.vmap(lambda seed: jax.random.split(jax.random.key(seed)))(jnp.asarray(seeds, jnp.uint32))
@@ -202,6 +205,24 @@ def fit(
     return result
 
 
+def _demonstrations_per_seed(demonstrations: Episodes | Sequence[Episodes], seeds: Sequence[int], env: RecordableEnvironment) -> Episodes:
+    """Stacks one table per seed (leaves (S, ...)), having checked that the tables fit the seeds and the environment."""
+    if not seeds or not all(0 <= seed < 2**32 for seed in seeds):
+        raise UserError(f"seeds = {list(seeds)} is not usable: give at least one whole number from 0 to {2**32 - 1}")
+    tables = [demonstrations] * len(seeds) if isinstance(demonstrations, Episodes) else list(demonstrations)
+    if len(tables) != len(seeds):
+        raise UserError(f"{len(tables)} tables of demonstrations for {len(seeds)} seeds: give one for all, or one for each")
+    expected = (env.horizon + 1, env.observation_dim, env.horizon, env.action_dim)
+    for table in tables:
+        found = table.observations.shape[1:] + table.actions.shape[1:]
+        if found != expected or table.observations.shape[0] < 1 or table.observations.shape != (len(tables[0].lengths), *found[:2]):
+            raise UserError(
+                f"demonstrations of shapes {table.observations.shape} and {table.actions.shape} do not fit {env.name}: it takes one or more, "
+                f"as many for each seed, with observations (N, {expected[0]}, {expected[1]}) and actions (N, {expected[2]}, {expected[3]})"
+            )
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *tables)
+
+
 class _Programs:
     """The compiled programs of one experiment, mapped over seeds."""
 
@@ -209,14 +230,18 @@ class _Programs:
         def program(function: Callable[..., Any], **static: Any) -> Callable[..., Any]:
             return jax.vmap(functools.partial(function, env=env, config=config, **static))
 
+        cloning = config.algo == "bc"
+        warm_up, per_iteration = (0, 1) if cloning else (training.warm_up_iterations(env, config), config.num_envs)
+        to_learn = config.steps - warm_up * per_iteration
+        if to_learn < 1:
+            raise UserError(f"steps = {config.steps} ends within the {warm_up * per_iteration} random steps before learning: raise steps")
+        chunk = max(1, min(config.eval_every // CHUNKS_PER_EVALUATION, to_learn) // per_iteration)
         self.guidance = jax.jit(program(training.guidance))(demonstrations)
         init = jax.jit(program(training.init)).lower(key_init, self.guidance).compile(_RUN_ONCE)
         self.state = init(key_init, self.guidance)
-        cloning = config.algo == "bc"
-        chunk = max(1, config.eval_every // (1 if cloning else config.num_envs) // CHUNKS_PER_EVALUATION)
         state, policy = (self.state, self.guidance), (key_init, self.state.agent.average_actor, self.guidance)
         learn = program(training.clone if cloning else training.learn, num_iterations=chunk)
-        collect = program(training.collect, num_iterations=-(-config.learning_starts // config.num_envs))
+        collect = program(training.collect, num_iterations=warm_up)
         lowered = {
             "learn": jax.jit(learn, donate_argnums=0).lower(*state),
             "evaluate": jax.jit(program(training.evaluate, num_episodes=config.eval_episodes)).lower(*policy),

@@ -5,6 +5,8 @@ Atoms (quantiles) lie on the leading axes and the batch on the last: on a CPU th
 
 from __future__ import annotations
 
+from typing import Literal
+
 import jax
 import jax.numpy as jnp
 
@@ -116,7 +118,7 @@ def target_atoms(next_atoms: Array, *, reward: Array, discount: Array, entropy_b
     return jax.lax.stop_gradient(reward[None] + discount[None] * (kept + entropy_bonus[None]))
 
 
-def behaviour_cloning(policy_action: Array, demonstrated_action: Array, is_demonstration: Array, *, form: str) -> Array:
+def behaviour_cloning(policy_action: Array, demonstrated_action: Array, is_demonstration: Array, *, form: Literal["squared", "norm"]) -> Array:
     """Behaviour cloning loss: masked by "is a demonstration row", divided by the whole batch (thesis eq. 2.32).
 
     Args:
@@ -128,11 +130,11 @@ def behaviour_cloning(policy_action: Array, demonstrated_action: Array, is_demon
       () loss.
     """
     squared = jnp.sum(jnp.square(policy_action - demonstrated_action), axis=-1)
-    loss = squared if form == "squared" else jnp.sqrt(squared + 1e-12)
+    loss = {"squared": squared, "norm": jnp.sqrt(squared + 1e-12)}[form]
     return jnp.mean(jnp.where(is_demonstration, loss, 0.0))
 
 
-def entropy_coefficient(log_alpha: Array, log_prob: Array, *, target_entropy: float) -> Array:
+def entropy_coefficient(log_alpha: Array, log_prob: Array, *, target_entropy: Array | float) -> Array:
     """Loss whose gradient raises alpha while the policy's entropy is below the target: -mean(log_alpha (log_prob + target)).
 
     As in Stable-Baselines3, it is linear in log alpha (Haarnoja et al., SAC applications, 2018, eq. 18, use alpha itself).

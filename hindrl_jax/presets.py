@@ -16,6 +16,9 @@ from hindrl_jax.registry import did_you_mean
 
 Preset = Literal["default", "thesis", "original"]
 
+ORIGINAL_RULES = {"strict_order": False}
+"""Arguments of the grid environments under which the original code ran: its rules let the last object win alone."""
+
 
 def preset(algo: Algorithm = "hindrl", name: Preset = "default") -> TrainConfig:
     """The config of a model.

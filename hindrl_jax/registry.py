@@ -76,11 +76,11 @@ def checked(build: Callable[[], Any]) -> Any:
     """Runs a constructor whose ValueErrors are written for the user."""
     try:
         return build()
-    except (ValueError, TypeError) as error:
+    except ValueError as error:
         raise UserError(str(error)) from error
 
 
 def did_you_mean(word: str, known: Any) -> str:
-    """`; did you mean 'x'?` if something known is close, else nothing."""
+    """` (did you mean 'x'?)` if something known is close, else nothing."""
     close = difflib.get_close_matches(word, list(known), n=1)
     return f" (did you mean {close[0]!r}?)" if close else ""

@@ -35,6 +35,8 @@ def hindsight_steps(key: Array, steps: Array, lengths: Array, *, strategy: Liter
     Returns:
       (B,) int32 index of a state, 0 <= index <= length.
     """
+    if strategy not in ("final", "future", "episode"):
+        raise ValueError(f"strategy = {strategy!r} takes no goals from the episode: choose final, future or episode")
     if strategy == "final":
         return lengths
     first = steps + 1 if strategy == "future" else jnp.zeros_like(steps)
@@ -67,5 +69,7 @@ def relabelled_goals(
     demonstrated = sample_goals(key_goal, table, hindsight_goals.shape[0])
     if strategy == "task_conditioned":
         return demonstrated
+    if strategy != "joint_union":
+        raise ValueError(f"unknown strategy {strategy!r}: choose final, future, episode, task_conditioned or joint_union")
     from_demonstration = jax.random.bernoulli(key_union, union_sampling_ratio, (hindsight_goals.shape[0], 1))
     return jnp.where(from_demonstration, demonstrated, hindsight_goals)

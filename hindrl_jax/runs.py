@@ -9,12 +9,14 @@ curve.png, episode.gif
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
 import json
 import os
 import resource
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -36,6 +38,8 @@ from hindrl_jax.types import action_to_env
 
 CONFIG, METRICS, SUMMARY, PARAMETERS = "config.json", "metrics.csv", "summary.json", "parameters.npz"
 CURVE, EPISODE = "curve.png", "episode.gif"
+FROM_PYTHON = "given from Python"
+_FILES = (CONFIG, METRICS, SUMMARY, PARAMETERS, CURVE, EPISODE)
 _ROW_FIELDS = [field.name for field in dataclasses.fields(Row) if field.name != "metrics"]
 
 
@@ -132,14 +136,19 @@ class RunWriter:
         """Only checks; nothing is written or removed before `start`.
 
         Raises:
-          UserError: if the path is a file, or holds a run and `overwrite` is off.
+          UserError: if the path is a file, cannot be written, or holds (part of) a run and `overwrite` is off.
         """
         self.path, self.spec = path, spec
         if path.exists() and not path.is_dir():
             raise UserError(f"{path} is a file: choose another --out")
-        if (path / CONFIG).exists() and not overwrite:
-            raise UserError(f"{path} already holds a run: choose another --out, or replace it with --overwrite")
+        there = [name for name in _FILES if (path / name).exists()]
+        if there and not overwrite:
+            raise UserError(f"{path} already holds a run ({', '.join(there)}): choose another --out, or replace it with --overwrite")
+        existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+        if not os.access(existing, os.W_OK):
+            raise UserError(f"cannot write {path} ({existing} is read-only): choose another --out")
         self.rows_written = 0
+        self.started = False
 
     def start(self) -> None:
         """Removes what an earlier run left, then writes the configuration.
@@ -147,13 +156,12 @@ class RunWriter:
         Raises:
           UserError: if the directory cannot be written.
         """
-        try:
+        with _disk_trouble(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
-            for name in (CONFIG, METRICS, SUMMARY, PARAMETERS, CURVE, EPISODE):
+            for name in _FILES:
                 (self.path / name).unlink(missing_ok=True)
             _write_atomically(self.path / CONFIG, json.dumps(self.spec.to_json(), indent=2) + "\n")
-        except OSError as error:
-            raise UserError(f"cannot write {self.path} ({error.strerror}): choose another --out") from error
+        self.started = True
 
     def report(self, result: Result) -> None:
         """Appends the evaluations that are new since the last call to `metrics.csv`."""
@@ -161,7 +169,7 @@ class RunWriter:
         if not rows:
             return
         fields = [*_ROW_FIELDS, *rows[0].metrics]
-        with (self.path / METRICS).open("a", newline="") as file:
+        with _disk_trouble(self.path), (self.path / METRICS).open("a", newline="") as file:
             writer = csv.DictWriter(file, fields)
             if self.rows_written == 0:
                 writer.writeheader()
@@ -173,16 +181,16 @@ class RunWriter:
     def finish(self, result: Result) -> dict[str, Any]:
         """Writes the parameters, the summary, the curve and the film of an episode; returns the summary."""
         self.report(result)
-        _save_parameters(self.path / PARAMETERS, result)
         summary = summarise(result)
-        plots.save_curve(result, self.path / CURVE)
-        run = load_run(self.path, summary=summary)
-        run.render(self.path / EPISODE)
-        _write_atomically(self.path / SUMMARY, json.dumps(summary, indent=2) + "\n")
+        with _disk_trouble(self.path):
+            _save_parameters(self.path / PARAMETERS, result)
+            _write_atomically(self.path / SUMMARY, json.dumps(summary, indent=2) + "\n")
+            plots.save_curve(result, self.path / CURVE)
+        load_run(self.path).render(self.path / EPISODE)
         return summary
 
 
-def save_run(path: str | os.PathLike[str], result: Result, *, demos: str = "given from Python", overwrite: bool = False) -> dict[str, Any]:
+def save_run(path: str | os.PathLike[str], result: Result, *, demos: str = FROM_PYTHON, overwrite: bool = False) -> dict[str, Any]:
     """Writes a finished experiment as a run directory, as `hindrl train` does; returns the summary.
 
     Args:
@@ -224,7 +232,6 @@ class Run:
 
     path: Path
     spec: RunSpec
-    summary: dict[str, Any] | None
     policies: Any
     """Parameters of the policies, leaves (S, ...)."""
     behavioural_goals: GoalTable
@@ -261,6 +268,7 @@ class Run:
           UserError: if the run has no such seed.
         """
         env, config = self.spec.env, self.spec.config
+        _check_drawable(path)
         seed = self.spec.seeds[0] if seed is None else seed
         if seed not in self.spec.seeds:
             raise UserError(f"{self.path} has no seed {seed}: choose one of {', '.join(map(str, self.spec.seeds))}")
@@ -281,19 +289,37 @@ def draw_episode(path: Path, env: RecordableEnvironment, states: np.ndarray) -> 
     """Draws an episode from its states (length + 1, S): a GIF of all of them, or a PNG of the last.
 
     Raises:
-      UserError: for another kind of file.
+      UserError: for another kind of file, a place that cannot be written, or states of another environment.
     """
+    _check_drawable(path)
+    if states.shape[-1] != env.state_dim:
+        raise UserError(f"states of {states.shape[-1]} numbers are not those of {env.name}, which has {env.state_dim}: record them again")
     key = jax.random.key(0)
     unpacked = [env.vector_to_state(key, jnp.asarray(state)) for state in states]
-    if path.suffix == ".gif":
-        viewer(env).save_gif(env, unpacked, path)
-    elif path.suffix == ".png":
-        viewer(env).save_png(env, unpacked[-1], path)
-    else:
+    with _disk_trouble(path):
+        if path.suffix == ".gif":
+            viewer(env).save_gif(env, unpacked, path)
+        else:
+            viewer(env).save_png(env, unpacked[-1], path)
+
+
+def _check_drawable(path: Path) -> None:
+    if path.suffix not in (".gif", ".png"):
         raise UserError(f"cannot draw {path.name}: the name must end in .gif or .png")
+    if not path.parent.is_dir():
+        raise UserError(f"cannot write {path}: there is no folder {path.parent}; make it first")
 
 
-def load_run(path: str | os.PathLike[str], *, summary: dict[str, Any] | None = None) -> Run:
+@contextlib.contextmanager
+def _disk_trouble(path: Path) -> Iterator[None]:
+    """Turns what the disk refuses into one line for the user."""
+    try:
+        yield
+    except OSError as error:
+        raise UserError(f"cannot write {path} ({error.strerror or error}): free some space or choose another place") from error
+
+
+def load_run(path: str | os.PathLike[str]) -> Run:
     """Reads a run's directory.
 
     Raises:
@@ -312,9 +338,7 @@ def load_run(path: str | os.PathLike[str], *, summary: dict[str, Any] | None = N
         policies = tree["policy"]
     except (OSError, ValueError, KeyError, EOFError) as error:
         raise UserError(f"{file} is damaged ({str(error).splitlines()[0]}): train again") from error
-    if summary is None and (path / SUMMARY).exists():
-        summary = json.loads((path / SUMMARY).read_text())
-    return Run(path=path, spec=spec, summary=summary, policies=policies, behavioural_goals=goals, scale=scale)
+    return Run(path=path, spec=spec, policies=policies, behavioural_goals=goals, scale=scale)
 
 
 def _save_parameters(path: Path, result: Result) -> None:

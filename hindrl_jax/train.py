@@ -17,7 +17,6 @@ from hindrl_jax import agent as agents
 from hindrl_jax import goals, replay, rollout
 from hindrl_jax.agent import AgentState, InputScale, Metrics
 from hindrl_jax.config import TrainConfig
-from hindrl_jax.errors import UserError
 from hindrl_jax.goals import GoalTable
 from hindrl_jax.randomness import uniform_index
 from hindrl_jax.replay import ReplayState
@@ -88,23 +87,24 @@ def init(key: Array, data: Guidance, env: Environment, config: TrainConfig) -> T
     """A fresh agent, an empty replay and `num_envs` episodes about to begin.
 
     Raises:
-      UserError: if the replay is too small, or learning would start before the first episode is complete.
+      UserError: if the replay is too small.
     """
     key_agent, key_rollout, key_train = jax.random.split(key, 3)
-    if config.algo != "bc" and config.learning_starts < config.num_envs * env.horizon:
-        raise UserError(
-            f"learning_starts = {config.learning_starts} is too early: with {config.num_envs} environments and a horizon of "
-            f"{env.horizon} no episode need be complete before {config.num_envs * env.horizon} steps"
-        )
     dims = dict(observation_dim=env.observation_dim, goal_dim=env.goal_dim, action_dim=env.action_dim)
+    smallest = 2 * config.num_envs * env.horizon
     return TrainState(
         agent=agents.init(key_agent, config.agent, **dims),
-        replay=replay.init(num_envs=config.num_envs, capacity=config.buffer_size, horizon=env.horizon, **dims),
+        replay=replay.init(num_envs=config.num_envs, capacity=smallest if config.algo == "bc" else config.buffer_size, horizon=env.horizon, **dims),
         rollout=rollout.reset(key_rollout, env, data.behavioural_goals, config.num_envs),
         key=key_train,
         env_steps=jnp.asarray(0),
         updates=jnp.asarray(0),
     )
+
+
+def warm_up_iterations(env: Environment, config: TrainConfig) -> int:
+    """Steps of every environment before learning: `learning_starts` in all, and enough for a complete episode in each."""
+    return max(-(-config.learning_starts // config.num_envs), env.horizon)
 
 
 def make_policy(actor: Any, scale: InputScale, env: Environment, config: TrainConfig, *, stochastic: bool) -> Act:
@@ -216,7 +216,8 @@ def clone(state: TrainState, data: Guidance, *, env: Environment, config: TrainC
             config=config.batch,
         )
         inputs = _network_inputs(batch, data.scale, env, config)["inputs"]
-        agent, metrics = agents.update_bc(state.agent, batch, inputs=inputs, config=config.agent)
+        schedule = agents.schedule(jnp.minimum(state.updates / config.steps, 1.0), config.agent, action_dim=env.action_dim)
+        agent, metrics = agents.update_bc(state.agent, batch, inputs=inputs, schedule=schedule, config=config.agent)
         return state.replace(agent=agent, key=key, updates=state.updates + 1), metrics
 
     state, metrics = jax.lax.scan(gradient_step, state, length=num_iterations)

@@ -12,8 +12,9 @@ PURE = STANDARD_LIBRARY | {"jax", "flax", "optax", "chex"}
 # Module of the core -> the modules of the core that it may import.
 CORE = {
     "errors": set(),
+    "checks": set(),
     "types": set(),
-    "config": {"types"},
+    "config": {"checks"},
     "randomness": {"types"},
     "goals": {"types", "config", "randomness"},
     "relabel": {"types", "config", "randomness", "goals"},
@@ -79,7 +80,7 @@ def uses_linen(path):
 @pytest.mark.parametrize("path", ENVS, ids=name_of)
 def test_env_imports_only_core_types_and_goals(path):
     # An environment may use its neighbours in envs, but never a viewer.
-    assert not_allowed(path, PURE | {"numpy", "hindrl_jax.types", "hindrl_jax.goals", "envs"}) == []
+    assert not_allowed(path, PURE | {"numpy", "hindrl_jax.checks", "hindrl_jax.types", "hindrl_jax.goals", "envs"}) == []
     assert not any("viewer" in name.split(".") for name in imports(path))
 
 
@@ -90,7 +91,7 @@ def test_viewer_may_draw_as_well(path):
 
 @pytest.mark.parametrize("path", EXPERTS, ids=name_of)
 def test_expert_imports_only_envs_and_core_types(path):
-    assert not_allowed(path, PURE | {"numpy", "hindrl_jax.errors", "hindrl_jax.types", "envs", "experts"}) == []
+    assert not_allowed(path, PURE | {"numpy", "hindrl_jax.checks", "hindrl_jax.errors", "hindrl_jax.types", "envs", "experts"}) == []
 
 
 def test_there_is_something_to_check():

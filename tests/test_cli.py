@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
+import re
 import shlex
 import subprocess
 import sys
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -64,7 +67,7 @@ def test_run_directory_holds_what_it_promises(run):
     assert [set(seed) for seed in summary["seeds"]] == [SEED_FIELDS] * 2
     assert [seed["seed"] for seed in summary["seeds"]] == [5, 6]
     assert all(seed["env_steps_to_95"] is None for seed in summary["seeds"])
-    rows = list(csv.DictReader((run / "metrics.csv").open()))
+    rows = list(csv.DictReader((run / "metrics.csv").read_text().splitlines()))
     # 200 random steps, then chunks of 4 steps (a tenth of eval_every, in steps of 2 environments): evaluations at 240 and 260 for 2 seeds
     assert [(row["seed"], row["env_steps"], row["updates"]) for row in rows] == [
         ("5", "240", "20"),
@@ -99,6 +102,49 @@ def test_eval_and_render_read_the_run_back(run, tmp_path, capsys):
     assert "must end in .gif or .png" in refusal(capsys, "render", run, "--to", tmp_path / "film.avi")
 
 
+def test_the_configuration_keeps_its_number_of_seeds(run):
+    spec, _ = cli._parse_train(["--config", str(run), "--seed", "100"])
+    assert spec.seeds == (100, 101)
+
+
+def test_files_that_are_not_ours_are_not_replaced(tmp_path, capsys):
+    (tmp_path / "summary.json").write_text("mine")
+    assert "summary.json" in refusal(capsys, "train", "--out", tmp_path, *TINY)
+    assert (tmp_path / "summary.json").read_text() == "mine"
+
+
+def test_drawing_into_nowhere_is_refused(run, demos_file, tmp_path, capsys):
+    nowhere = tmp_path / "nowhere" / "film.gif"
+    assert "no folder" in refusal(capsys, "render", run, "--to", nowhere)
+    assert "no folder" in refusal(capsys, "demos", "render", demos_file, "--to", nowhere)
+
+
+def test_unsolved_demonstrations_are_dropped_with_a_warning(demos_file, capsys):
+    with h5py.File(demos_file, "r+") as file:
+        file["data/demo_0/dones"][-1] = 0
+    spec, _ = cli._parse_train(["--demos", str(demos_file)])
+    with pytest.warns(UserWarning, match="1 of 2"):
+        (demonstrations,) = cli._demonstrations(spec)
+    assert demonstrations.lengths.shape == (1,)
+    with h5py.File(demos_file, "r+") as file:
+        file["data/demo_1/dones"][-1] = 0
+    assert "none of its demonstrations solves" in refusal(capsys, "train", "--demos", demos_file)
+
+
+def test_the_original_preset_plays_by_the_original_rules():
+    assert cli._parse_train(["--preset", "original"])[0].env.strict_order is False
+    assert cli._parse_train(["--preset", "thesis"])[0].env.strict_order is True
+
+
+README_COMMANDS = re.findall(r"^hindrl (train [^#\n]*)", (Path(__file__).parent.parent / "README.md").read_text(), re.MULTILINE)
+
+
+@pytest.mark.parametrize("command", README_COMMANDS)
+def test_commands_of_the_readme_parse(command, run):
+    arguments = [str(run) if word == "runs/eight" and "--config" in command else word for word in shlex.split(command)]
+    cli._parse_train(arguments)
+
+
 def test_existing_run_is_refused_and_kept(run, capsys):
     before = {file.name: file.read_bytes() for file in run.iterdir()}
     assert "already holds a run" in refusal(capsys, "train", "--out", run, *TINY)
@@ -126,7 +172,7 @@ def test_existing_run_is_refused_and_kept(run, capsys):
         (["train", "--seeds", "0"], "--seeds 0"),
         (["train", "--seed", "-1"], "--seed -1"),
         (["train", "--batch-size", "4", "--max-demo-ratio", "1.0"], "leaves no replay row"),
-        (["train", "--learning-starts", "10"], "learning_starts = 10"),
+        (["train", "--num-objects", "2.5"], "2.5"),
         (["train", "--steps", "100"], "steps = 100"),
         (["train", "--buffer-size", "200"], "buffer_size = 200"),
         (["train", "--num-objects", "99"], "99"),
@@ -191,7 +237,17 @@ def test_envs_lists_every_environment(capsys):
     assert all(name in printed for name in cli.TASKS)
 
 
-def test_every_config_field_is_a_flag():
+def test_every_config_field_is_a_flag(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["train", "--help"])
+    printed = capsys.readouterr().out
+    config = cli.preset()
+    for part in (config, config.batch, config.goal, config.agent, cli.make("FixedGridPickAndPlace")):
+        for field in dataclasses.fields(part):
+            assert dataclasses.is_dataclass(getattr(part, field.name)) or f"--{field.name.replace('_', '-')}" in printed, field.name
+
+
+def test_flags_of_each_type():
     arguments = ["--batch-size", "64", "--no-inclusive-goal-test", "--target-entropy", "-2.5", "--reach-zero", "None", "--num-objects", "3"]
     spec, _ = cli._parse_train(arguments)
     assert (spec.config.batch.batch_size, spec.config.batch.inclusive_goal_test) == (64, False)

@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from hindrl_jax.checks import check_types
 from hindrl_jax.types import Array, TimeStep
 
 Box = tuple[tuple[int, int], tuple[int, int]]  # lowest and highest (x, y), both inside the box
@@ -59,6 +60,7 @@ class _PickAndPlace(abc.ABC):
     """Enforce the order of the objects at success, as the thesis says; off: holding the last object on the goal always wins."""
 
     def __post_init__(self):
+        check_types(self)
         for field in ("size", "num_objects", "horizon"):
             if getattr(self, field) < 1:
                 raise ValueError(f"{field} must be at least 1, got {getattr(self, field)}.")
@@ -236,7 +238,7 @@ class FixedGridPickAndPlace(_PickAndPlace):
 
     With d = size and b = random_box_size, the agent starts in the corner box at (0, 0), the goal is in the one at (0, d-1), object 0 starts in the
     one at (d-1, 0) and object 1 in the one at (d-1, d-1). The original supports only these two objects. Our choice for more: object 2 starts in the
-    centre of the grid and objects 3 to 6 at the middle of the right, bottom (y = 0), top and left edge.
+    centre of the grid and objects 3 to 6 at the middle of the edges at x = d-1, y = 0, y = d-1 and x = 0.
     """
 
     name: ClassVar[str] = "FixedGridPickAndPlace"

@@ -1,0 +1,46 @@
+"""Checking the fields of the project's frozen dataclasses: configs, environments, experts."""
+
+from __future__ import annotations
+
+import math
+from types import UnionType
+from typing import Any, ClassVar, Literal, get_args, get_origin, get_type_hints
+
+
+def check_types(instance: object) -> None:
+    """Raises ValueError naming the first field whose value is not of the type that its annotation asks for."""
+    for name, hint in get_type_hints(type(instance)).items():
+        if get_origin(hint) is not ClassVar and not _matches(getattr(instance, name), hint):
+            raise ValueError(f"{name} = {getattr(instance, name)!r} is not usable: it must be {_in_words(hint)}")
+
+
+def check(instance: object, **conditions: tuple[bool, str]) -> None:
+    """Raises ValueError naming the first field whose condition does not hold, its value and what is asked of it."""
+    for name, (holds, requirement) in conditions.items():
+        if not holds:
+            raise ValueError(f"{name} = {getattr(instance, name)!r} is not usable: it must be {requirement}")
+
+
+def _matches(value: object, hint: Any) -> bool:
+    """Whether a value is of the (simple) type that a field asks for; an int serves as a float, a bool as neither, NaN and infinity as nothing."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return value in arguments
+    if origin is UnionType:
+        return any(_matches(value, argument) for argument in arguments)
+    if origin is tuple:
+        return isinstance(value, tuple) and all(_matches(item, arguments[0]) for item in value)
+    if hint is float:
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, hint) and (hint is bool or not isinstance(value, bool))
+
+
+def _in_words(hint: Any) -> str:
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return f"one of {', '.join(map(str, arguments))}"
+    if origin is UnionType:
+        return " or ".join(_in_words(argument) for argument in arguments)
+    if origin is tuple:
+        return "a list of whole numbers"
+    return {int: "a whole number", float: "a finite number", bool: "true or false", type(None): "none"}.get(hint, f"a {hint.__name__}")
