@@ -16,6 +16,7 @@ import json
 import os
 import resource
 import sys
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -331,12 +332,12 @@ def load_run(path: str | os.PathLike[str]) -> Run:
     if not file.exists():
         raise UserError(f"{path} holds no {PARAMETERS}: the run did not finish; start it again with `hindrl train --config {path / CONFIG}`")
     try:
-        with np.load(file, allow_pickle=False) as archive:
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             tree = unflatten_dict({name: jnp.asarray(archive[name]) for name in archive.files}, sep="/")
         goals = GoalTable(goals=tree["behavioural_goals"]["goals"], count=tree["behavioural_goals"]["count"])
         scale = InputScale(observation=tree["input_scale"]["observation"], goal=tree["input_scale"]["goal"])
         policies = tree["policy"]
-    except (OSError, ValueError, KeyError, EOFError) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise UserError(f"{file} is damaged ({str(error).splitlines()[0]}): train again") from error
     return Run(path=path, spec=spec, policies=policies, behavioural_goals=goals, scale=scale)
 

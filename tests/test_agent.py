@@ -31,6 +31,7 @@ CONFIG = AgentConfig(
 )
 NUM_UPDATES = 400
 B = 32
+SCHEDULE = agents.schedule(0.0, CONFIG, action_dim=1)
 
 
 def make_batch(*, action, reward, discount, observation=None, next_observation=None, is_demonstration=False):
@@ -269,7 +270,9 @@ def test_update_bc_overfits_a_tiny_batch_and_touches_only_the_actor():
 
     @jax.jit
     def clone(start):
-        return jax.lax.scan(lambda state, _: agents.update_bc(state, batch, inputs=inputs, config=CONFIG), start, length=NUM_UPDATES)
+        return jax.lax.scan(
+            lambda state, _: agents.update_bc(state, batch, inputs=inputs, schedule=SCHEDULE, config=CONFIG), start, length=NUM_UPDATES
+        )
 
     start = fresh_agent(jax.random.key(9))
     end, metrics = clone(start)

@@ -342,16 +342,20 @@ def test_demonstrated_actions_may_be_paired_with_the_observation_after_them():
         assert lived.rewards[row, :length].tolist() == [0.0] * (length - 1) + [1.0]
 
 
-def test_learning_may_not_start_before_an_episode_is_complete(data):
+def test_warm_up_lasts_until_an_episode_can_be_complete():
+    horizon = make_env().horizon
+    assert train.warm_up_iterations(make_env(), make_config(learning_starts=0)) == horizon
+    assert train.warm_up_iterations(make_env(), make_config(learning_starts=NUM_ENVS * horizon + 1, steps=10**6)) == horizon + 1
+
+
+def test_too_small_replay_is_refused(data):
     def start(**changes):
         return jax.eval_shape(lambda key: train.init(key, data, make_env(), make_config(**changes)), jax.random.key(0))
 
-    with pytest.raises(ValueError, match=r"learning_starts = 20 .* 21 steps"):
-        start(learning_starts=NUM_ENVS * HORIZON - 1)
     with pytest.raises(ValueError, match="buffer_size = 41"):
         start(buffer_size=2 * NUM_ENVS * HORIZON - 1)
-    start(learning_starts=NUM_ENVS * HORIZON, buffer_size=2 * NUM_ENVS * HORIZON)
-    start(algo="bc", learning_starts=0)
+    start(buffer_size=2 * NUM_ENVS * HORIZON)
+    start(algo="bc", buffer_size=1)  # cloning stores nothing
 
 
 def grid_demonstrations(env, num):
