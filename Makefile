@@ -4,7 +4,7 @@ PIP = .venv/bin/python -m pip install -q --disable-pip-version-check
 
 .PHONY: train test test-slow lint clean
 
-train: .venv/.installed  ## one demonstration, one seed, a few minutes
+train: .venv/.installed  ## one demonstration, one seed, about a minute
 	.venv/bin/hindrl train --env FixedGridPickAndPlace --algo hindrl --demos 1 --seeds 1 --out runs/quickstart --overwrite
 
 test: .venv/.installed-test
