@@ -109,8 +109,8 @@ class AgentConfig:
     """Number of quantile critics."""
     num_quantiles: int = 25
     """Quantiles per critic."""
-    top_quantiles_to_drop_per_net: int = 0
-    """Largest target quantiles dropped per critic (TQC's truncation); its pessimism costs more than it saves where rewards are sparse."""
+    top_quantiles_to_drop_per_net: int = 2
+    """Largest target quantiles dropped per critic (TQC's truncation)."""
     target_update_rate: float = 0.02
     """Share of the online critics that moves into the target critics at each gradient step (Polyak averaging)."""
     actor_average_rate: float = 0.002
