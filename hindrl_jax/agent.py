@@ -2,7 +2,8 @@
 
 One `update` serves TQCfD, HinDRL and Smooth HinDRL, which differ only in the batch they are given; `update_bc` is the BC baseline, on the
 same actor. Differences from the TQC paper (Kuznetsov et al., 2020): the loss is averaged, not summed, over quantiles (as in sb3-contrib,
-which the thesis used), and the discount comes with each transition, so that n-step returns and termination need no special case.
+which the thesis used), and the discount comes with each transition, so that n-step returns and termination need no special case. By default
+also: inputs encoded at two scales, a target entropy that falls along the run, and a running average of the actor for evaluation.
 """
 
 from __future__ import annotations
@@ -140,7 +141,7 @@ def _descend(gradient: Any, optimiser_state: optax.OptState, params: Any, learni
 def update(
     key: Array, state: AgentState, batch: Transition, *, inputs: Array, next_inputs: Array, schedule: Schedule, config: AgentConfig
 ) -> tuple[AgentState, Metrics]:
-    """One gradient step of entropy coefficient, critics and actor, then of the target critics.
+    """One gradient step of critics, actor and entropy coefficient, then one move of the target critics and of the averaged actor.
 
     Critic: quantile Huber loss towards the truncated atoms of r + discount (Z' - alpha log pi(a' | s')).
     Actor: mean(alpha log pi - mean over critics and quantiles of Z(s, a_pi)) + bc_weight * behaviour cloning loss.
