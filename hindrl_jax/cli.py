@@ -416,12 +416,19 @@ def _parse(arguments_class: type[Any], arguments: list[str], program: str, descr
 
 
 def _first_sentence(complaint: str) -> str:
-    """The message in tyro's box: the lines before the first rule, and the flag it suggests, if any."""
-    lines = [line.strip("│ ").strip() for line in complaint.splitlines() if line.startswith("│")]
-    rule = next((index for index, line in enumerate(lines) if set(line) <= {"─"}), len(lines))
-    message = re.sub(r"^Error parsing \S*(training|environment|options|expert)\S*: ", "", " ".join(lines[:rule]))
-    suggestion = next((line.split()[0] for line in lines[rule:] if line.startswith("--")), None)
-    return f"{message} (did you mean {suggestion}?)" if suggestion and message.startswith("Unrecognized") else message
+    """The message of tyro's box, and the flag it suggests, if any. Where the terminal is not known to speak UTF-8, the box has no visible border."""
+    bordered = "│" in complaint
+    lines = [line.strip("│ ") for line in complaint.splitlines() if line.startswith("│") or not bordered]
+    sections: list[list[str]] = [[]]
+    for line in lines:
+        if line and set(line) <= {"─", "-"}:
+            sections.append([])
+        elif line:
+            sections[-1].append(line)
+    message, *rest = sections if bordered else sections[1:]  # without a border, the title is a section of its own
+    text = re.sub(r"^Error parsing (?!-)\S+: ", "", " ".join(message))
+    suggestion = next((line.split()[0] for section in rest for line in section if line.startswith("--")), None)
+    return f"{text} (did you mean {suggestion}?)" if suggestion and text.startswith("Unrecognized") else text
 
 
 def _usage() -> str:

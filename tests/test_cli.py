@@ -136,7 +136,7 @@ def test_the_original_preset_plays_by_the_original_rules():
     assert cli._parse_train(["--preset", "thesis"])[0].env.strict_order is True
 
 
-README_COMMANDS = re.findall(r"^hindrl (train [^#\n]*)", (Path(__file__).parent.parent / "README.md").read_text(), re.MULTILINE)
+README_COMMANDS = re.findall(r"^hindrl train ([^#\n]*)", (Path(__file__).parent.parent / "README.md").read_text(), re.MULTILINE)
 
 
 @pytest.mark.parametrize("command", README_COMMANDS)

@@ -83,7 +83,7 @@ def test_steps_are_counted(learnt):
     assert int(first.env_steps) == NUM_ENVS * (COLLECT_STEPS + LEARN_STEPS)
     assert int(second.env_steps) == NUM_ENVS * (COLLECT_STEPS + 2 * LEARN_STEPS)
     assert (int(first.updates), int(second.updates)) == (2 * LEARN_STEPS, 4 * LEARN_STEPS)
-    assert int(first.agent.critic_optimiser[0].count) == 2 * LEARN_STEPS
+    assert int(first.agent.critic_optimiser.count) == 2 * LEARN_STEPS
     # What is in the replay is what was stepped: complete episodes, and the beginning of those under way.
     episodes, slots = second.replay.episodes, second.replay.episodes.lengths.shape[0] // NUM_ENVS
     assert slots == 30_000 // (NUM_ENVS * HORIZON)
