@@ -8,6 +8,7 @@ also: inputs encoded at two scales, a target entropy that falls along the run, a
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -17,7 +18,7 @@ from flax import struct
 
 from hindrl_jax.config import AgentConfig
 from hindrl_jax.losses import behaviour_cloning, entropy_coefficient, quantile_huber, target_atoms
-from hindrl_jax.networks import ActionDistribution, Params, apply_actor, apply_critics, init_actor, init_critics
+from hindrl_jax.networks import Params, apply_actor, apply_critics, init_actor, init_critics, mean_return
 from hindrl_jax.types import Array, Transition
 
 Metrics = dict[str, Array]
@@ -107,9 +108,10 @@ def init(key: Array, config: AgentConfig, *, observation_dim: int, goal_dim: int
     )
 
 
-def policy(actor: Params, inputs: Array, config: AgentConfig, *, action_dim: int) -> ActionDistribution:
-    """The distribution over actions at inputs (B, input_dim), see `network_inputs`."""
-    return apply_actor(actor, inputs, config, action_dim=action_dim)
+def select_action(key: Array, actor: Params, inputs: Array, config: AgentConfig, *, action_dim: int, stochastic: bool) -> Array:
+    """Actions (B, A) in [-1, 1] at inputs (B, input_dim), see `network_inputs`: sampled from the policy, or its mode."""
+    distribution = apply_actor(actor, inputs.T, config, action_dim=action_dim)
+    return (distribution.sample(key)[0] if stochastic else distribution.mode).T
 
 
 @struct.dataclass(kw_only=True)
@@ -138,6 +140,45 @@ def _descend(gradient: Any, optimiser_state: optax.OptState, params: Any, learni
     return jax.tree.map(lambda param, update: param - learning_rate * update, params, updates), optimiser_state
 
 
+@struct.dataclass(kw_only=True)
+class _Columns:
+    """A batch as networks and losses take it: one column per transition."""
+
+    inputs: Array  # (input_dim, B)
+    next_inputs: Array  # (input_dim, B)
+    action: Array  # (A, B)
+    reward: Array  # (B,)
+    discount: Array  # (B,)
+    is_demonstration: Array  # (B,) bool
+
+
+_BLOCK_BYTES = 2**19
+
+
+def _num_blocks(batch_size: int, config: AgentConfig) -> int:
+    """Into how many equal blocks a batch is cut on a CPU, so that the activations of one layer stay in a core's cache; elsewhere 1."""
+    if jax.default_backend() != "cpu":
+        return 1
+    needed = -(-4 * max(config.net_arch) * batch_size // _BLOCK_BYTES)
+    return next((blocks for blocks in range(needed, 2 * needed) if batch_size % blocks == 0), 1)
+
+
+def _mean_over_blocks(key: Array, function: Callable[[Array, _Columns], Any], columns: _Columns, num_blocks: int) -> Any:
+    """The mean of function(key, block) over equal blocks of columns; for means over columns, that is function(key, columns) itself."""
+    if num_blocks == 1:
+        return function(key, columns)
+
+    def cut(array: Array) -> Array:  # (..., B) -> (blocks, ..., B / blocks)
+        return jnp.moveaxis(array.reshape((*array.shape[:-1], num_blocks, -1)), -2, 0)
+
+    def one_block(key: Array, block: _Columns) -> tuple[Array, Any]:
+        key, key_block = jax.random.split(key)
+        return key, function(key_block, block)
+
+    _, values = jax.lax.scan(one_block, key, jax.tree.map(cut, columns))
+    return jax.tree.map(lambda value: jnp.mean(value, axis=0), values)
+
+
 def update(
     key: Array, state: AgentState, batch: Transition, *, inputs: Array, next_inputs: Array, schedule: Schedule, config: AgentConfig
 ) -> tuple[AgentState, Metrics]:
@@ -159,37 +200,59 @@ def update(
     """
     key_actor, key_next = jax.random.split(key)
     action_dim = batch.action.shape[-1]
+    num_blocks = _num_blocks(batch.action.shape[0], config)
     alpha = jnp.exp(state.log_alpha)
-
-    next_action, next_log_prob = policy(state.actor, next_inputs, config, action_dim=action_dim).sample(key_next)
-    next_atoms = apply_critics(state.target_critics, next_inputs, next_action, config)
-    targets = target_atoms(
-        next_atoms.reshape(-1, next_atoms.shape[-1]),
+    # The barrier makes the transposition one copy, not a strided read in every product.
+    inputs, next_inputs, action = jax.lax.optimization_barrier((inputs.T, next_inputs.T, batch.action.T))
+    columns = _Columns(
+        inputs=inputs,
+        next_inputs=next_inputs,
+        action=action,
         reward=batch.reward,
         discount=batch.discount,
-        entropy_bonus=-alpha * next_log_prob,
-        num_dropped=config.num_critics * config.top_quantiles_to_drop_per_net,
+        is_demonstration=batch.is_demonstration,
     )
 
-    def critic_loss(critics: Params) -> tuple[Array, Array]:
-        quantiles = apply_critics(critics, inputs, batch.action, config)
-        return jnp.mean(quantile_huber(quantiles, targets)), jnp.mean(quantiles)
+    def critic_gradient(key: Array, block: _Columns) -> tuple[Params, Metrics]:
+        next_action, next_log_prob = apply_actor(state.actor, block.next_inputs, config, action_dim=action_dim).sample(key)
+        next_atoms = apply_critics(state.target_critics, block.next_inputs, next_action, config)
+        targets = target_atoms(
+            next_atoms.reshape(-1, next_atoms.shape[-1]),
+            reward=block.reward,
+            discount=block.discount,
+            entropy_bonus=-alpha * next_log_prob,
+            num_dropped=config.num_critics * config.top_quantiles_to_drop_per_net,
+        )
 
-    (loss_critic, value), gradient = jax.value_and_grad(critic_loss, has_aux=True)(state.critics)
+        def loss(critics: Params) -> tuple[Array, Metrics]:
+            quantiles = apply_critics(critics, block.inputs, block.action, config)
+            value = jnp.mean(quantile_huber(quantiles, targets))
+            return value, {"critic/loss": value, "critic/value": jnp.mean(quantiles), "critic/target": jnp.mean(targets)}
+
+        return jax.grad(loss, has_aux=True)(state.critics)
+
+    gradient, critic_metrics = _mean_over_blocks(key_next, critic_gradient, columns, num_blocks)
     critics, critic_optimiser = _descend(gradient, state.critic_optimiser, state.critics, schedule.learning_rate)
 
-    def actor_loss(actor: Params) -> tuple[Array, tuple[Array, Array, Array]]:
-        distribution = policy(actor, inputs, config, action_dim=action_dim)
-        action, log_prob = distribution.sample(key_actor)
-        value = jnp.mean(apply_critics(critics, inputs, action, config), axis=(0, 1))
-        cloned = distribution.mode if config.bc_action == "mean" else action
-        bc = behaviour_cloning(cloned, batch.action, batch.is_demonstration, form=config.bc_loss)
-        return jnp.mean(alpha * log_prob - value) + config.bc_weight * bc, (log_prob, bc, jnp.mean(value))
+    def actor_gradient(key: Array, block: _Columns) -> tuple[Params, Metrics]:
+        def loss(actor: Params) -> tuple[Array, Metrics]:
+            distribution = apply_actor(actor, block.inputs, config, action_dim=action_dim)
+            action, log_prob = distribution.sample(key)
+            value = jnp.mean(mean_return(critics, block.inputs, action, config))
+            cloned = distribution.mode if config.bc_action == "mean" else action
+            bc = behaviour_cloning(cloned, block.action, block.is_demonstration, form=config.bc_loss)
+            entropy = -jnp.mean(log_prob)
+            total = -alpha * entropy - value + config.bc_weight * bc
+            return total, {"actor/loss": total, "actor/bc_loss": bc, "actor/value": value, "actor/entropy": entropy}
 
-    (loss_actor, (log_prob, bc, policy_value)), gradient = jax.value_and_grad(actor_loss, has_aux=True)(state.actor)
+        return jax.grad(loss, has_aux=True)(state.actor)
+
+    gradient, actor_metrics = _mean_over_blocks(key_actor, actor_gradient, columns, num_blocks)
     actor, actor_optimiser = _descend(gradient, state.actor_optimiser, state.actor, schedule.learning_rate)
 
-    loss_alpha, gradient = jax.value_and_grad(entropy_coefficient)(state.log_alpha, log_prob, target_entropy=schedule.target_entropy)
+    loss_alpha, gradient = jax.value_and_grad(entropy_coefficient)(
+        state.log_alpha, -actor_metrics["actor/entropy"], target_entropy=schedule.target_entropy
+    )
     log_alpha, alpha_optimiser = _descend(gradient, state.alpha_optimiser, state.log_alpha, schedule.learning_rate)
 
     new_state = AgentState(
@@ -203,13 +266,8 @@ def update(
         alpha_optimiser=alpha_optimiser,
     )
     metrics = {
-        "critic/loss": loss_critic,
-        "critic/value": value,
-        "critic/target": jnp.mean(targets),
-        "actor/loss": loss_actor,
-        "actor/bc_loss": bc,
-        "actor/value": policy_value,
-        "actor/entropy": -jnp.mean(log_prob),
+        **critic_metrics,
+        **actor_metrics,
         "alpha/loss": loss_alpha,
         "alpha/value": alpha,
         "batch/reward": jnp.sum(batch.reward),
@@ -232,8 +290,8 @@ def update_bc(state: AgentState, batch: Transition, *, inputs: Array, schedule: 
     """
 
     def loss(actor: Params) -> Array:
-        action = policy(actor, inputs, config, action_dim=batch.action.shape[-1]).mode
-        return jnp.mean(jnp.square(action - batch.action))
+        action = apply_actor(actor, inputs.T, config, action_dim=batch.action.shape[-1]).mode
+        return jnp.mean(jnp.square(action.T - batch.action))
 
     value, gradient = jax.value_and_grad(loss)(state.actor)
     actor, actor_optimiser = _descend(gradient, state.actor_optimiser, state.actor, schedule.learning_rate)

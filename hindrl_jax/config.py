@@ -101,6 +101,8 @@ class AgentConfig:
     """Widths of the hidden layers, the same for actor and critics."""
     layer_norm: bool = False
     """Layer normalisation before each activation of the critics."""
+    network_precision: Literal["float32", "bfloat16"] = "float32"
+    """Operands of the networks' products; bfloat16 (summed in float32) is faster on CPUs and GPUs that have it and less exact."""
     learning_rate: float = 1e-3
     """Adam's step size, for actor, critics and entropy coefficient."""
     final_learning_rate: float | None = None

@@ -122,14 +122,14 @@ def behaviour_cloning(policy_action: Array, demonstrated_action: Array, is_demon
     """Behaviour cloning loss: masked by "is a demonstration row", divided by the whole batch (thesis eq. 2.32).
 
     Args:
-      policy_action, demonstrated_action: (B, A) in [-1, 1].
+      policy_action, demonstrated_action: (A, B) in [-1, 1].
       is_demonstration: (B,) bool, the mask delta^e.
       form: "squared" for the squared distance (thesis text), "norm" for the distance itself (original code).
 
     Returns:
       () loss.
     """
-    squared = jnp.sum(jnp.square(policy_action - demonstrated_action), axis=-1)
+    squared = jnp.sum(jnp.square(policy_action - demonstrated_action), axis=0)
     loss = {"squared": squared, "norm": jnp.sqrt(squared + 1e-12)}[form]
     return jnp.mean(jnp.where(is_demonstration, loss, 0.0))
 
@@ -141,7 +141,7 @@ def entropy_coefficient(log_alpha: Array, log_prob: Array, *, target_entropy: Ar
 
     Args:
       log_alpha: () logarithm of the entropy coefficient.
-      log_prob: (B,) log-probabilities of sampled actions, treated as constants.
+      log_prob: (B,) log-probabilities of sampled actions, or () their mean; treated as constants.
       target_entropy: the entropy aimed at, in nats.
 
     Returns:

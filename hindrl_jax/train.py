@@ -112,8 +112,7 @@ def make_policy(actor: Any, scale: InputScale, env: Environment, config: TrainCo
 
     def act(key: Array, observation: Array, desired_goal: Array) -> Array:
         inputs = agents.network_inputs(observation, env.achieved_goal(observation), desired_goal, scale, config.agent)
-        distribution = agents.policy(actor, inputs, config.agent, action_dim=env.action_dim)
-        return distribution.sample(key)[0] if stochastic else distribution.mode
+        return agents.select_action(key, actor, inputs, config.agent, action_dim=env.action_dim, stochastic=stochastic)
 
     return act
 

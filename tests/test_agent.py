@@ -1,5 +1,6 @@
 """The agent on probe problems with known values: batches made by hand, a few hundred updates, small networks."""
 
+import dataclasses
 import functools
 
 import chex
@@ -96,12 +97,13 @@ def last(states):
 @jax.jit
 def values(state, observation, action):
     """Mean over critics and quantiles: (rows,)."""
-    return jnp.mean(apply_critics(state.critics, inputs_of(observation, CONFIG), action, CONFIG), axis=(0, 1))
+    return jnp.mean(apply_critics(state.critics, inputs_of(observation, CONFIG).T, action.T, CONFIG), axis=(0, 1))
 
 
 @jax.jit
 def mean_action(state, observation):
-    return agents.policy(state.actor, inputs_of(observation, CONFIG), CONFIG, action_dim=1).mode
+    inputs = inputs_of(observation, CONFIG)
+    return agents.select_action(jax.random.key(0), state.actor, inputs, CONFIG, action_dim=1, stochastic=False)
 
 
 ACTIONS = np.linspace(-1.0, 1.0, B, dtype=np.float32)[:, None]
@@ -291,3 +293,48 @@ def test_learning_rate_moves_linearly_or_not_at_all():
     assert np.allclose([agents.schedule(progress, moving, action_dim=1).learning_rate for progress in (0.0, 0.5, 1.0)], [1e-3, 5.5e-4, 1e-4])
     constant = AgentConfig(learning_rate=1e-3, final_learning_rate=None)
     assert [agents.schedule(progress, constant, action_dim=1).learning_rate for progress in (0.0, 1.0)] == [1e-3, 1e-3]
+
+
+def test_blocks_are_as_few_as_the_cache_allows_and_equal(monkeypatch):
+    monkeypatch.setattr(agents, "_BLOCK_BYTES", 1000)
+    config = AgentConfig(net_arch=(5, 10))  # 40 bytes per row: at most 25 rows per block
+    assert [agents._num_blocks(batch_size, config) for batch_size in (1, 25, 26, 100, 120, 103)] == [1, 1, 2, 4, 5, 1]  # 103 is a prime
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert agents._num_blocks(100, config) == 1
+
+
+def test_mean_over_blocks_is_the_mean_over_the_batch():
+    rng = np.random.default_rng(0)
+    columns = agents._Columns(
+        inputs=jnp.asarray(rng.normal(size=(3, 12)), jnp.float32),
+        next_inputs=jnp.zeros((3, 12)),
+        action=jnp.asarray(rng.normal(size=(2, 12)), jnp.float32),
+        reward=jnp.arange(12.0),
+        discount=jnp.ones(12),
+        is_demonstration=jnp.arange(12) < 5,
+    )
+
+    def function(key, block):
+        # Columns stay together: a product of different fields would show a mixture.
+        product = block.inputs[0] * block.action[1] * block.reward * block.is_demonstration
+        return {"mean": jnp.mean(product), "matrix": block.inputs @ block.action.T / block.reward.shape[0]}
+
+    expected = function(None, columns)
+    for num_blocks in (1, 2, 3, 12):
+        given = agents._mean_over_blocks(jax.random.key(0), function, columns, num_blocks)
+        chex.assert_trees_all_close(given, expected, rtol=1e-5, atol=1e-6)
+    draws = jax.vmap(lambda key: jax.random.normal(key, (3,)))
+    noise = agents._mean_over_blocks(jax.random.key(0), lambda key, block: draws(jax.random.split(key, 1)), columns, 4)
+    alone = draws(jax.random.split(jax.random.key(0), 1))
+    assert np.abs(noise).max() < np.abs(alone).max()  # every block has noise of its own, so that its mean is smaller
+
+
+def test_an_update_in_blocks_learns_the_same_values(monkeypatch):
+    monkeypatch.setattr(agents, "_BLOCK_BYTES", 4 * 16 * B // 4)
+    config = dataclasses.replace(CONFIG, num_critics=3)  # a config of its own, so that nothing compiled before is used
+    assert agents._num_blocks(B, config) == 4
+    reward = np.linspace(0.0, 1.0, B)
+    batch = make_batch(action=ACTIONS, reward=reward, discount=0.0)
+    start = jax.jit(lambda key: agents.init(key, config, observation_dim=2, goal_dim=1, action_dim=1))(jax.random.key(0))
+    states, _ = train(5, batch, config, start)
+    np.testing.assert_allclose(values(last(states), batch.observation, batch.action), reward, atol=0.08)

@@ -75,6 +75,7 @@ BAD = [
     (GoalConfig, "misalign_demo_actions", [1.0]),
     (AgentConfig, "net_arch", [(), (8, 0), [8, 8], (8.0,), 8]),
     (AgentConfig, "layer_norm", [1]),
+    (AgentConfig, "network_precision", ["float16", 32]),
     (AgentConfig, "learning_rate", [0.0, -1e-3, float("inf"), "1e-3"]),
     (AgentConfig, "num_critics", [0]),
     (AgentConfig, "num_quantiles", [0]),

@@ -124,11 +124,11 @@ def test_behaviour_cloning_by_hand(form, expected):
     policy = jnp.array([[3.0, 4.0], [1.0, 2.0], [1.0, 1.0], [9.0, 9.0]])
     demonstrated = jnp.array([[0.0, 0.0], [1.0, 1.0], [1.0, 1.0], [0.0, 0.0]])
     mask = jnp.array([True, True, True, False])
-    value, gradient = jax.value_and_grad(behaviour_cloning)(policy, demonstrated, mask, form=form)
+    value, gradient = jax.value_and_grad(behaviour_cloning)(policy.T, demonstrated.T, mask, form=form)
     np.testing.assert_allclose(value, expected, rtol=1e-5)
     # d|x|^2 = 2x and d|x| = x / |x|, divided by four; finite at distance 0.
     first = [6.0 / 4, 8.0 / 4] if form == "squared" else [0.6 / 4, 0.8 / 4]
-    np.testing.assert_allclose(gradient, [first, [0.0, 0.5 if form == "squared" else 0.25], [0.0, 0.0], [0.0, 0.0]], rtol=1e-5)
+    np.testing.assert_allclose(gradient.T, [first, [0.0, 0.5 if form == "squared" else 0.25], [0.0, 0.0], [0.0, 0.0]], rtol=1e-5)
 
 
 @pytest.mark.parametrize(
