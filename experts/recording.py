@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from hindrl_jax.errors import UserError
@@ -109,8 +110,7 @@ def record(key: Array, env: RecordableEnvironment, expert: Expert, num_demos: in
                 f"but {num_demos} demonstrations are wanted: raise the horizon or ask for fewer"
             )
         key, key_batch = jax.random.split(key)
-        batch = _play_expert(key_batch, env, expert, batch_size)
-        solved = jnp.flatnonzero(batch.episodes.terminated)
-        kept.append(jax.tree.map(lambda leaf, rows=solved: leaf[rows], batch))
+        batch = jax.device_get(_play_expert(key_batch, env, expert, batch_size))
+        kept.append(jax.tree.map(lambda leaf, solved=batch.episodes.terminated: leaf[solved], batch))
         attempts += batch_size
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:num_demos], *kept)
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)[:num_demos]), *kept)

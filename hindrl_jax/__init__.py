@@ -13,9 +13,11 @@ The algorithm is in `goals`, `relabel`, `replay`, `networks`, `losses`, `agent`,
 from __future__ import annotations
 
 import importlib
+import time
 from typing import Any
 
 __version__ = "0.1.0"
+STARTED = time.perf_counter()  # this package loads before the large ones it uses, so that start-up can be timed
 
 # Loaded on first use: `envs` and `experts` import the core below this package, and the names here import `envs` and `experts`.
 _EXPORTS = {

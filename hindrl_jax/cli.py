@@ -5,12 +5,13 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import io
+import itertools
 import os
 import re
 import sys
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -24,15 +25,15 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from experts.recording import RecordableEnvironment
-from hindrl_jax import __version__
-from hindrl_jax.config import TrainConfig
+from hindrl_jax import STARTED, __version__
+from hindrl_jax.config import SWEEPABLE, TrainConfig, with_values
 from hindrl_jax.datasets import describe_demonstrations, load_demonstrations, read_states, save_demonstrations
 from hindrl_jax.errors import UserError
 from hindrl_jax.experiment import Result, fit, record_demonstrations
 from hindrl_jax.goals import epsilon_from_demonstrations, goal_table
 from hindrl_jax.presets import ORIGINAL_RULES, Preset, preset
-from hindrl_jax.registry import TASKS, did_you_mean, make, task
-from hindrl_jax.runs import FROM_PYTHON, RunSpec, RunWriter, draw_episode, load_run, read_spec
+from hindrl_jax.registry import TASKS, checked, did_you_mean, make, task
+from hindrl_jax.runs import FROM_PYTHON, RunSpec, RunWriter, SweepWriter, draw_episode, load_run, read_spec, summarise
 from hindrl_jax.types import Episodes
 
 _TYRO = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
@@ -44,7 +45,7 @@ console = Console(highlight=False, soft_wrap=True)
 
 @dataclasses.dataclass(frozen=True)
 class TrainOptions:
-    """Options of `hindrl train` that belong to the run as a whole."""
+    """Options of `hindrl train` and `hindrl sweep` that belong to the run as a whole."""
 
     demos: str = "1"
     """Demonstrations: a number to record with the task's expert for each seed, or an HDF5 file that all seeds share."""
@@ -56,35 +57,140 @@ class TrainOptions:
     """Directory of the run (default: runs/ENV_ALGO_TIME)."""
     overwrite: bool = False
     """Replace a run that is already there."""
+    distributed: bool = False
+    """Share the seeds with other hosts: start the same command on each of them. The first one writes. Clusters that JAX knows (SLURM, Open
+    MPI, Kubernetes, TPU) need nothing else; others need the three options below."""
+    coordinator: str | None = None
+    """With --distributed: address of the first host, as HOST:PORT."""
+    num_hosts: int | None = None
+    """With --distributed: number of hosts."""
+    host: int | None = None
+    """With --distributed: which of them this is, from 0."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SweepOptions(TrainOptions):
+    """Options of `hindrl sweep`."""
+
+    over: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """A field and its values, as in learning_rate=1e-4,3e-4,1e-3. Given several times, all combinations are trained, with all their seeds side by
+    side in one compiled program. The field is one that only enters arithmetic: learning_rate, bc_weight, gamma, ..."""
 
 
 def _train(arguments: list[str]) -> None:
     """Train policies from demonstrations."""
     spec, options = _parse_train(arguments)
-    out = options.out or Path("runs") / f"{spec.env.name}_{spec.config.algo}_{time.strftime('%Y%m%d_%H%M%S')}"
-    writer = RunWriter(out, spec, overwrite=options.overwrite)
+    with _hosts(options) as writes:
+        out = options.out or _default_out(spec)
+        writers = [RunWriter(out, spec, overwrite=options.overwrite)] if writes else []
+        result = _fit(spec, [spec.config], writers)
+        if writes:
+            summary = writers[0].finish(result)
+            console.print(_summary_table(summary))
+            console.print(_speed_line(summary))
+            console.print(f"wrote {out}: config.json, metrics.csv, summary.json, curve.png, episode.gif, parameters.npz")
+
+
+def _sweep(arguments: list[str]) -> None:
+    """Train with several values of hyperparameters, side by side."""
+    spec, options = _parse_train(arguments, SweepOptions, "hindrl sweep")
+    settings = list(_grid(options.over, spec.config))
+    configs = [checked(lambda values=values: with_values(spec.config, values)) for values in settings]
+    with _hosts(options) as writes:
+        out = options.out or _default_out(spec, "sweep")
+        writer = SweepWriter(out, spec, settings, overwrite=options.overwrite) if writes else None
+        result = _fit(spec, configs, writer.runs if writer else [])
+        if writer:
+            table = Table(*settings[0], "95% reached", "median steps", "mean final", "worst", box=box.SIMPLE_HEAD)
+            for row in writer.finish(result):
+                table.add_row(*row.values())
+            console.print(table)
+            console.print(_speed_line(summarise(result)))
+            console.print(f"wrote {out}: sweep.csv, sweep.png, and a run's directory for each setting")
+
+
+def _default_out(spec: RunSpec, *words: str) -> Path:
+    return Path("runs") / "_".join([spec.env.name, spec.config.algo, *words, time.strftime("%Y%m%d_%H%M%S")])
+
+
+def _grid(over: Sequence[str], config: TrainConfig) -> Iterator[dict[str, float]]:
+    """All combinations of the values of --over, in order."""
+    values: dict[str, list[float]] = {}
+    for given in over:
+        name, _, listed = given.partition("=")
+        name = name.strip().lstrip("-").replace("-", "_")
+        if name not in SWEEPABLE:
+            raise UserError(f"--over {given}: {name!r} cannot be swept{did_you_mean(name, SWEEPABLE)}; choose one of {', '.join(SWEEPABLE)}")
+        if name in values:
+            raise UserError(f"--over {given}: {name} is given twice; list all its values in one --over")
+        try:
+            values[name] = [float(value) for value in listed.split(",")]
+        except ValueError:
+            raise UserError(f"--over {given} is not a field and its values: write for example --over {name}=0.1,0.2") from None
+        if len(set(values[name])) < len(values[name]):
+            raise UserError(f"--over {given}: a value is listed twice")
+    if not values:
+        raise UserError("--over is missing: say what to sweep, for example --over learning_rate=1e-4,3e-4,1e-3")
+    return (dict(zip(values, combination, strict=True)) for combination in itertools.product(*values.values()))
+
+
+@contextlib.contextmanager
+def _hosts(options: TrainOptions) -> Iterator[bool]:
+    """Joins the other hosts, if there are any; yields whether this is the host that writes and prints."""
+    given = {name: getattr(options, name) for name in ("coordinator", "num_hosts", "host")}
+    if not options.distributed:
+        for name, value in given.items():
+            if value is not None:
+                raise UserError(f"--{name.replace('_', '-')} is for training on several hosts: add --distributed, or drop it")
+        yield True
+        return
+    if any(value is None for value in given.values()) and any(value is not None for value in given.values()):
+        raise UserError("--coordinator, --num-hosts and --host belong together: give all three, or none where the cluster tells JAX")
+    try:
+        jax.distributed.initialize(options.coordinator, options.num_hosts, options.host)
+    except (RuntimeError, ValueError) as error:
+        raise UserError(
+            f"cannot join the other hosts ({str(error).splitlines()[0]}): give --coordinator HOST:PORT --num-hosts N --host I on each"
+        ) from error
+    try:
+        yield jax.process_index() == 0
+    finally:
+        jax.distributed.shutdown()
+
+
+def _fit(spec: RunSpec, configs: Sequence[TrainConfig], writers: Sequence[RunWriter]) -> Result:
+    """Trains all seeds of all configs at once, with a progress bar; each writer gets the runs of its config. Without writers, quietly."""
     demonstrations = _demonstrations(spec)
-    num_seeds = len(spec.seeds)
+    num_seeds, num_runs = len(spec.seeds), len(spec.seeds) * len(configs)
     seeds = f"seed {spec.seeds[0]}" if num_seeds == 1 else f"{num_seeds} seeds from {spec.seeds[0]}"
-    console.print(f"{spec.env.name}, {spec.config.algo}, {_count(demonstrations[0].lengths.shape[0], 'demonstration')}, {seeds}")
+    settings = f", {len(configs)} settings" if len(configs) > 1 else ""
+    runs = dict(seeds=spec.seeds * len(configs), config=[config for config in configs for _ in spec.seeds])
+    if not writers:
+        return fit(spec.env, demonstrations * len(configs), **runs)
+    console.print(f"{spec.env.name}, {spec.config.algo}, {_count(demonstrations[0].lengths.shape[0], 'demonstration')}, {seeds}{settings}")
 
     unit = "updates" if spec.config.algo == "bc" else "steps"
     columns = ("{task.description}", BarColumn(), f"{{task.completed:,.0f}}/{{task.total:,.0f}} {unit}", "{task.fields[rates]}", "left")
     progress = Progress(*(TextColumn(c) if isinstance(c, str) else c for c in columns), TimeRemainingColumn(), console=console)
     with progress:
         bar = progress.add_task("compiling", total=spec.config.steps, rates="")
+        reported = {"rows": 0, "updates": 0}
 
         def report(result: Result) -> None:
-            if not writer.started:
-                writer.start()
-                progress.console.print(f"compiled in {result.compile_seconds:.1f} s")
-            new_rows = result.rows[writer.rows_written :]
-            writer.report(result)
-            if new_rows:
-                progress.console.print(_evaluation_line(new_rows))
+            if not writers[0].started:
+                for writer in writers:
+                    writer.start()
+                progress.console.print(f"compiled in {result.compile_seconds:.1f} s{_on_devices(result)}")
+            if result.updates and not reported["updates"]:
+                progress.console.print(f"first update after {time.perf_counter() - STARTED:.1f} s")
+            for index, writer in enumerate(writers):
+                writer.report(result.rows_of(slice(index * num_seeds, (index + 1) * num_seeds)))
+            if len(result.rows) > reported["rows"]:
+                progress.console.print(_evaluation_line(result.rows[reported["rows"] :]))
+            reported.update(rows=len(result.rows), updates=result.updates)
             success = result.latest_success()
             seconds = max(result.train_seconds, 1e-9)
-            rates = f"{num_seeds * result.env_steps / seconds:,.0f} steps/s, {num_seeds * result.updates / seconds:,.0f} updates/s"
+            rates = f"{num_runs * result.env_steps / seconds:,.0f} steps/s, {num_runs * result.updates / seconds:,.0f} updates/s"
             progress.update(
                 bar,
                 completed=min(result.steps_done, spec.config.steps),
@@ -92,18 +198,23 @@ def _train(arguments: list[str]) -> None:
                 rates=rates if result.train_seconds else "",
             )
 
-        result = fit(spec.env, demonstrations, spec.config, seeds=spec.seeds, report=report)
-    summary = writer.finish(result)
-    console.print(_summary_table(summary))
-    console.print(
+        return fit(spec.env, demonstrations * len(configs), **runs, report=report)
+
+
+def _on_devices(result: Result) -> str:
+    devices = result.state.env_steps.sharding.device_set
+    return f" for {len(devices)} devices" if len(devices) > 1 else ""
+
+
+def _speed_line(summary: dict[str, Any]) -> str:
+    return (
         f"{summary['updates_per_second']:,.0f} updates/s and {summary['env_steps_per_second']:,.0f} environment steps/s over all seeds, "
         f"{summary['train_seconds']:.1f} s of training after {summary['compile_seconds']:.1f} s of compilation, "
         f"peak memory {summary['peak_memory_bytes'] / 2**20:,.0f} MiB"
     )
-    console.print(f"wrote {out}: config.json, metrics.csv, summary.json, curve.png, episode.gif, parameters.npz")
 
 
-def _parse_train(arguments: list[str]) -> tuple[RunSpec, TrainOptions]:
+def _parse_train(arguments: list[str], options_class: type[TrainOptions] = TrainOptions, program: str = "hindrl train") -> tuple[RunSpec, Any]:
     """Environment, algorithm and preset decide which flags there are and their defaults, so they are read first."""
     chosen = {name: _peek(arguments, name) for name in ("env", "algo", "preset", "config")}
     if chosen["config"] is not None:
@@ -121,7 +232,7 @@ def _parse_train(arguments: list[str]) -> tuple[RunSpec, TrainOptions]:
         ("env", Literal[tuple(TASKS)], spec.env.name, "The environment; `hindrl envs` lists them."),
         ("preset", Preset, chosen["preset"] or "default", "Where the other defaults come from: our recipe, the thesis, or its original code."),
         ("config", Path | None, None, "Run again what a config.json (or the directory of a run) says; other flags change it."),
-        ("options", TrainOptions, TrainOptions(demos=spec.demos), ""),
+        ("options", options_class, options_class(demos=spec.demos), ""),
         ("training", TrainConfig, spec.config, ""),
         ("environment", environment_class, spec.env, ""),
     ]
@@ -130,7 +241,7 @@ def _parse_train(arguments: list[str]) -> tuple[RunSpec, TrainOptions]:
         [(name, Annotated[kind, tyro.conf.arg(help=text)] if text else kind, default) for name, kind, default, text in fields],
         frozen=True,
     )
-    parsed = _parse(namespace, arguments, "hindrl train", "Train policies from demonstrations.")
+    parsed = _parse(namespace, arguments, program, COMMANDS[program.split()[1]].__doc__)
     options = parsed.options
     seeds = spec.seeds
     if options.seeds is not None or options.seed is not None:
@@ -396,6 +507,7 @@ def _envs(arguments: list[str]) -> None:
 Command = Callable[[list[str]], None]
 COMMANDS: dict[str, Command | dict[str, Command]] = {
     "train": _train,
+    "sweep": _sweep,
     "eval": _eval,
     "render": _render,
     "demos": {"record": _demos_record, "info": _demos_info, "render": _demos_render},
@@ -456,19 +568,28 @@ def _count(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-def _keep_compiled_programs() -> None:
-    """Keeps compiled programs in the user's cache folder, so that a second start takes seconds. JAX's own settings win: JAX_COMPILATION_CACHE_DIR
-    names another folder, JAX_ENABLE_COMPILATION_CACHE=false turns it off."""
+def _set_up_jax() -> None:
+    """Settings that the user should not have to know, unless set by the user.
+
+    Compiled programs are kept in the user's cache folder, so that a second start takes seconds. JAX_COMPILATION_CACHE_DIR names another folder,
+    JAX_ENABLE_COMPILATION_CACHE=false turns it off. Each core counts as a device, so that several seeds are spread over the cores:
+    a core is busier with a seed of its own than with its share of every operation. JAX_NUM_CPU_DEVICES=1 turns that off.
+    """
     if jax.config.jax_compilation_cache_dir is None:
         folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hindrl_jax"
         jax.config.update("jax_compilation_cache_dir", str(folder))
+    if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    if "JAX_NUM_CPU_DEVICES" not in os.environ and "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        jax.config.update("jax_num_cpu_devices", cores or 1)
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the `hindrl` command; with arguments given, runs within this process as it is."""
     if arguments is None:
         arguments = sys.argv[1:]
-        _keep_compiled_programs()
+        _set_up_jax()
     if arguments in (["--help"], ["-h"], ["demos", "--help"], ["demos", "-h"]):
         print(_usage())
         return

@@ -6,20 +6,22 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from experts.recording import RecordableEnvironment, Recording, record
 from hindrl_jax import train as training
-from hindrl_jax.config import TrainConfig
+from hindrl_jax.agent import Metrics
+from hindrl_jax.config import SWEEPABLE, TrainConfig, sweepable_value, with_traced_values
+from hindrl_jax.devices import gather, over_seeds, seed_mesh, shapes_on, spread
 from hindrl_jax.errors import UserError
 from hindrl_jax.registry import task
+from hindrl_jax.rollout import Evaluation
 from hindrl_jax.train import Guidance, TrainState
-from hindrl_jax.types import Episodes
+from hindrl_jax.types import Array, Episodes
 
 SOLVED = 0.95
 FRESH_EPISODES = 100
@@ -63,48 +65,70 @@ class SeedSummary:
 
 @dataclasses.dataclass
 class Result:
-    """An experiment, finished or under way."""
+    """An experiment, finished or under way: S runs side by side."""
 
     env: RecordableEnvironment
-    config: TrainConfig
+    configs: tuple[TrainConfig, ...]
+    """(S,) the config of each run."""
     seeds: tuple[int, ...]
+    """(S,) the seed of each run."""
     guidance: Guidance
     """Leaves (S, ...)."""
     state: TrainState
     """Leaves (S, ...); the policies' parameters are `state.agent.average_actor`. While the run is under way the next chunk consumes it."""
     rows: list[Row]
-    """One row per evaluation and seed, in order of time."""
+    """In order of time, S rows per evaluation, in order of the runs."""
     compile_seconds: float
-    train_seconds: float
+    train_seconds: float = 0.0
     """Wall-clock time so far, evaluations included, compilation not."""
-    steps_done: int
-    """Environment steps per seed so far; for bc, gradient steps."""
+    env_steps: int = 0
+    """Environment steps of each run so far."""
+    updates: int = 0
+    """Gradient steps of each run so far."""
     final_success: np.ndarray | None = None
     """(S,) share of 100 fresh episodes that the final policies solve; None while the run is under way."""
     final_length: np.ndarray | None = None
     """(S,) mean length of those episodes."""
 
     @property
-    def updates(self) -> int:
-        """Gradient steps per seed so far."""
-        return int(self.state.updates[0])
+    def config(self) -> TrainConfig:
+        """The config of the first run; of all runs, unless `fit` was given several configs."""
+        return self.configs[0]
 
     @property
-    def env_steps(self) -> int:
-        """Environment steps per seed so far."""
-        return int(self.state.env_steps[0])
+    def steps_done(self) -> int:
+        """What `TrainConfig.steps` counts: environment steps of each run so far; for bc, gradient steps."""
+        return self.updates if self.config.algo == "bc" else self.env_steps
 
     def latest_success(self) -> float | None:
-        """Success of the newest evaluation, averaged over seeds; None before the first."""
+        """Success of the newest evaluation, averaged over runs; None before the first."""
         newest = self.rows[-len(self.seeds) :]
         return float(np.mean([row.success for row in newest])) if newest else None
 
     def summaries(self) -> list[SeedSummary]:
-        """One summary per seed of a finished run."""
+        """One summary per run of a finished experiment."""
         return [self._summary(index, seed) for index, seed in enumerate(self.seeds)]
 
+    def rows_of(self, runs: slice) -> list[Row]:
+        """The rows of some of the runs, in order of time."""
+        return [row for start in range(0, len(self.rows), len(self.seeds)) for row in self.rows[start : start + len(self.seeds)][runs]]
+
+    def part(self, runs: slice) -> Result:
+        """The finished experiment as if it had been about some of its runs only. Times are still those of all of them."""
+        guidance, agent = jax.tree.map(lambda leaf: leaf[runs], (self.guidance, self.state.agent))
+        return dataclasses.replace(
+            self,
+            configs=self.configs[runs],
+            seeds=self.seeds[runs],
+            guidance=guidance,
+            state=self.state.replace(agent=agent),
+            rows=self.rows_of(runs),
+            final_success=self.final_success[runs],
+            final_length=self.final_length[runs],
+        )
+
     def _summary(self, index: int, seed: int) -> SeedSummary:
-        rows = [row for row in self.rows if row.seed == seed]
+        rows = self.rows[index :: len(self.seeds)]
         first = next((row for row in rows if row.success >= SOLVED), None)
         return SeedSummary(
             seed=seed,
@@ -136,61 +160,62 @@ def record_demonstrations(env: RecordableEnvironment, num_demos: int, *, seed: i
 def fit(
     env: RecordableEnvironment,
     demonstrations: Episodes | Sequence[Episodes],
-    config: TrainConfig,
+    config: TrainConfig | Sequence[TrainConfig],
     *,
     seeds: Sequence[int] = (0,),
     report: Callable[[Result], None] = lambda result: None,
 ) -> Result:
     """Trains one policy per seed, all of them side by side in one compiled program.
 
+    With several devices the seeds are spread over them: of one host over as many as divide their number, of several hosts (after
+    `jax.distributed.initialize`, the same call on each) over all.
+
     Args:
       env: the task.
       demonstrations: one table for all seeds, or one table per seed (with equal numbers of demonstrations).
-      config: for example from `preset`.
+      config: for example from `preset`; one for all seeds, or one per seed. They may differ in the fields of `config.SWEEPABLE`.
       seeds: non-negative integers. A seed gives the same run whatever the others are, up to floating-point rounding.
       report: called after compilation, several times between evaluations, after each evaluation, and at the end.
 
     Returns:
-      The finished experiment.
+      The finished experiment. With several hosts, its agents are gathered on each of them, and the replay is not.
 
     Raises:
       UserError: if the config does not fit the environment.
     """
-    demonstrations = _demonstrations_per_seed(demonstrations, seeds, env)
-    if config.goal.misalign_demo_actions and int(demonstrations.lengths.min()) < 2:
+    if not seeds or not all(0 <= seed < 2**32 for seed in seeds):
+        raise UserError(f"seeds = {list(seeds)} is not usable: give at least one whole number from 0 to {2**32 - 1}")
+    tables = _demonstrations_per_seed(demonstrations, seeds, env)
+    configs = _configs_per_seed(config, seeds)
+    config = configs[0]
+    if config.goal.misalign_demo_actions and int(tables.lengths.min()) < 2:
         raise UserError("misalign_demo_actions needs demonstrations of at least 2 steps: turn it off or record others")
-    keys = jax.vmap(lambda seed: jax.random.split(jax.random.key(seed)))(jnp.asarray(seeds, jnp.uint32))
-    key_init, key_eval = keys[:, 0], keys[:, 1]
 
     started = time.perf_counter()
-    programs = _Programs(env, config, demonstrations, key_init)
-    guidance, state = programs.guidance, programs.state
-    result = Result(
-        env=env,
-        config=config,
-        seeds=tuple(seeds),
-        guidance=guidance,
-        state=state,
-        rows=[],
-        compile_seconds=time.perf_counter() - started,
-        train_seconds=0.0,
-        steps_done=0,
-    )
+    programs = _Programs(env, configs, tables)
+    seeds_on_devices, tables, values = spread((np.asarray(seeds, np.uint32), tables, programs.values), programs.mesh)
+    guidance, state, key = programs.start(seeds_on_devices, tables, values)
+    compile_seconds = time.perf_counter() - started
+    result = Result(env=env, configs=configs, seeds=tuple(seeds), guidance=guidance, state=state, rows=[], compile_seconds=compile_seconds)
     report(result)
 
     started = time.perf_counter()
     if config.algo != "bc":
-        result.state = jax.block_until_ready(programs.collect(result.state, guidance))
-        result.steps_done = result.env_steps
+        result.state = jax.block_until_ready(programs.collect(result.state, guidance, values))
+        result.env_steps = programs.warm_up * config.num_envs
     chunks_metrics: list[dict[str, np.ndarray]] = []
     next_evaluation = result.steps_done + config.eval_every
     while result.steps_done < config.steps:
-        result.state, metrics = programs.learn(result.state, guidance)
-        chunks_metrics.append(jax.device_get(metrics))
-        result.steps_done = result.updates if config.algo == "bc" else result.env_steps
+        result.state, metrics = programs.learn(result.state, guidance, values)
+        chunks_metrics.append(gather(metrics))
+        if config.algo == "bc":
+            result.updates += programs.chunk
+        else:
+            result.env_steps += programs.chunk * config.num_envs
+            result.updates += programs.chunk * config.updates_per_iteration
         if result.steps_done >= min(next_evaluation, config.steps):
-            key_eval, key_now = _split_all(key_eval)
-            evaluation = jax.device_get(programs.evaluate(key_now, result.state.agent.average_actor, guidance))
+            key, evaluation = programs.evaluate(key, result.state.agent.average_actor, guidance)
+            evaluation = gather(evaluation)
             result.train_seconds = time.perf_counter() - started
             averaged = {name: np.mean([chunk[name] for chunk in chunks_metrics], axis=0) for name in chunks_metrics[0]}
             result.rows += _rows(result, evaluation, averaged)
@@ -199,16 +224,18 @@ def fit(
         result.train_seconds = time.perf_counter() - started
         report(result)
 
-    fresh = jax.device_get(programs.evaluate_fresh(key_eval, result.state.agent.average_actor, guidance))
+    _, fresh = programs.evaluate_fresh(key, result.state.agent.average_actor, guidance)
+    fresh = gather(fresh)
     result.final_success, result.final_length = fresh.success.mean(axis=1), fresh.length.mean(axis=1)
+    if jax.process_count() > 1:
+        result.guidance, agent = gather((guidance, result.state.agent))
+        result.state = result.state.replace(agent=agent)
     report(result)
     return result
 
 
 def _demonstrations_per_seed(demonstrations: Episodes | Sequence[Episodes], seeds: Sequence[int], env: RecordableEnvironment) -> Episodes:
-    """Stacks one table per seed (leaves (S, ...)), having checked that the tables fit the seeds and the environment."""
-    if not seeds or not all(0 <= seed < 2**32 for seed in seeds):
-        raise UserError(f"seeds = {list(seeds)} is not usable: give at least one whole number from 0 to {2**32 - 1}")
+    """Stacks one table per seed (numpy leaves (S, ...)), having checked that the tables fit the seeds and the environment."""
     tables = [demonstrations] * len(seeds) if isinstance(demonstrations, Episodes) else list(demonstrations)
     if len(tables) != len(seeds):
         raise UserError(f"{len(tables)} tables of demonstrations for {len(seeds)} seeds: give one for all, or one for each")
@@ -220,49 +247,82 @@ def _demonstrations_per_seed(demonstrations: Episodes | Sequence[Episodes], seed
                 f"demonstrations of shapes {table.observations.shape} and {table.actions.shape} do not fit {env.name}: it takes one or more, "
                 f"as many for each seed, with observations (N, {expected[0]}, {expected[1]}) and actions (N, {expected[2]}, {expected[3]})"
             )
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *tables)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *jax.device_get(tables))
+
+
+def _configs_per_seed(config: TrainConfig | Sequence[TrainConfig], seeds: Sequence[int]) -> tuple[TrainConfig, ...]:
+    """One config per seed, having checked that one program can serve them all."""
+    configs = (config,) * len(seeds) if isinstance(config, TrainConfig) else tuple(config)
+    if len(configs) != len(seeds):
+        raise UserError(f"{len(configs)} configs for {len(seeds)} seeds: give one for all, or one for each")
+    swept = _swept_fields(configs)
+    for other in configs[1:]:
+        if with_traced_values(configs[0], {name: sweepable_value(other, name) for name in swept}) != other:
+            raise UserError(f"configs of one experiment may differ only in {', '.join(SWEEPABLE)}: run the others apart")
+    for name in swept:
+        if any(sweepable_value(config, name) is None for config in configs):
+            raise UserError(f"{name} is None in some configs and a number in others: give numbers only")
+    return configs
+
+
+def _swept_fields(configs: Sequence[TrainConfig]) -> list[str]:
+    return [name for name in SWEEPABLE if len({sweepable_value(config, name) for config in configs}) > 1]
 
 
 class _Programs:
-    """The compiled programs of one experiment, mapped over seeds."""
+    """The compiled programs of one experiment, mapped over its runs. Each takes the swept values (S,) of the config as its last argument."""
 
-    def __init__(self, env: RecordableEnvironment, config: TrainConfig, demonstrations: Episodes, key_init: jax.Array):
-        def program(function: Callable[..., Any], **static: Any) -> Callable[..., Any]:
-            return jax.vmap(functools.partial(function, env=env, config=config, **static))
-
+    def __init__(self, env: RecordableEnvironment, configs: Sequence[TrainConfig], demonstrations: Episodes):
+        config = configs[0]
         cloning = config.algo == "bc"
-        warm_up, per_iteration = (0, 1) if cloning else (training.warm_up_iterations(env, config), config.num_envs)
-        to_learn = config.steps - warm_up * per_iteration
+        self.warm_up, per_iteration = (0, 1) if cloning else (training.warm_up_iterations(env, config), config.num_envs)
+        to_learn = config.steps - self.warm_up * per_iteration
         if to_learn < 1:
-            raise UserError(f"steps = {config.steps} ends within the {warm_up * per_iteration} random steps before learning: raise steps")
-        chunk = max(1, min(config.eval_every // CHUNKS_PER_EVALUATION, to_learn) // per_iteration)
-        self.guidance = jax.jit(program(training.guidance))(demonstrations)
-        init = jax.jit(program(training.init)).lower(key_init, self.guidance).compile(_RUN_ONCE)
-        self.state = init(key_init, self.guidance)
-        state, policy = (self.state, self.guidance), (key_init, self.state.agent.average_actor, self.guidance)
-        learn = program(training.clone if cloning else training.learn, num_iterations=chunk)
-        collect = program(training.collect, num_iterations=warm_up)
-        lowered = {
-            "learn": jax.jit(learn, donate_argnums=0).lower(*state),
-            "evaluate": jax.jit(program(training.evaluate, num_episodes=config.eval_episodes)).lower(*policy),
-        }
-        if not cloning:
-            lowered["collect"] = jax.jit(collect, donate_argnums=0).lower(*state)
-        if config.eval_episodes != FRESH_EPISODES:
-            lowered["evaluate_fresh"] = jax.jit(program(training.evaluate, num_episodes=FRESH_EPISODES)).lower(*policy)
-        # Compilation leaves most of a core idle, so the programs are compiled side by side.
+            raise UserError(f"steps = {config.steps} ends within the {self.warm_up * per_iteration} random steps before learning: raise steps")
+        self.chunk = max(1, min(config.eval_every // CHUNKS_PER_EVALUATION, to_learn) // per_iteration)
+        self.values = {name: np.asarray([sweepable_value(c, name) for c in configs], np.float32) for name in _swept_fields(configs)}
+        self.mesh = seed_mesh(len(configs))
+
+        def program(function: Callable[..., Any], *, donate: bool = False) -> Any:
+            return jax.jit(over_seeds(function, self.mesh), donate_argnums=0 if donate else ())
+
+        def start(seed: Array, demonstrations: Episodes, values: dict[str, Array]) -> tuple[Guidance, TrainState, Array]:
+            actual = with_traced_values(config, values)
+            key_init, key_evaluate = jax.random.split(jax.random.key(seed))
+            guidance = training.guidance(demonstrations, env, actual)
+            return guidance, training.init(key_init, guidance, env, actual), key_evaluate
+
+        def collect(state: TrainState, guidance: Guidance, values: dict[str, Array]) -> TrainState:
+            return training.collect(state, guidance, env=env, config=with_traced_values(config, values), num_iterations=self.warm_up)
+
+        def learn(state: TrainState, guidance: Guidance, values: dict[str, Array]) -> tuple[TrainState, Metrics]:
+            iterate = training.clone if cloning else training.learn
+            return iterate(state, guidance, env=env, config=with_traced_values(config, values), num_iterations=self.chunk)
+
+        def evaluate(key: Array, actor: Any, guidance: Guidance, *, num_episodes: int) -> tuple[Array, Evaluation]:
+            key, key_play = jax.random.split(key)
+            return key, training.evaluate(key_play, actor, guidance, env=env, config=config, num_episodes=num_episodes)
+
+        # Everything is traced from shapes, and each program is handed to a thread that compiles it while the next one is being traced.
         with ThreadPoolExecutor() as pool:
-            compiled = dict(
-                zip(lowered, pool.map(lambda name: lowered[name].compile(_RUN_ONCE if name == "collect" else None), lowered), strict=True)
-            )
-        self.learn, self.evaluate, self.collect = compiled["learn"], compiled["evaluate"], compiled.get("collect")
-        self.evaluate_fresh = compiled.get("evaluate_fresh", self.evaluate)
 
+            def compiled(traced: Any, options: dict[str, Any] | None = None) -> Future[Any]:
+                return pool.submit(traced.lower().compile, options)
 
-def _split_all(keys: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Splits a vector of keys (S,) into two."""
-    split = jax.vmap(jax.random.split)(keys)
-    return split[:, 0], split[:, 1]
+            values = shapes_on(self.values, self.mesh)
+            seeds = jax.ShapeDtypeStruct((len(configs),), np.uint32)
+            traced = program(start).trace(*shapes_on((seeds, demonstrations), self.mesh), values)
+            guidance, state, key = shapes_on(traced.out_info, self.mesh)
+            actor = state.agent.average_actor
+            learning = compiled(program(learn, donate=True).trace(state, guidance, values))
+            starting = compiled(traced, _RUN_ONCE)
+            evaluating = {
+                num_episodes: compiled(program(functools.partial(evaluate, num_episodes=num_episodes)).trace(key, actor, guidance))
+                for num_episodes in {config.eval_episodes, FRESH_EPISODES}
+            }
+            collecting = None if cloning else compiled(program(collect, donate=True).trace(state, guidance, values), _RUN_ONCE)
+        self.start, self.learn, self.collect = starting.result(), learning.result(), collecting and collecting.result()
+        self.evaluate, self.evaluate_fresh = evaluating[config.eval_episodes].result(), evaluating[FRESH_EPISODES].result()
 
 
 def _rows(result: Result, evaluation: Any, metrics: dict[str, np.ndarray]) -> list[Row]:

@@ -6,7 +6,6 @@ the gradients of kernels and biases are fastest along contiguous batches.
 
 from __future__ import annotations
 
-import operator
 from typing import Any
 
 import jax
@@ -131,7 +130,7 @@ def _apply_each(params: Params, inputs: Array, action: Array, config: AgentConfi
     # One critic after the other: as one batched product they are slower on a CPU.
     joint = jnp.concatenate([inputs, action], axis=0)
     critic = _critic(config, out_dim)
-    members = [jax.tree.map(operator.itemgetter(n), params) for n in range(config.num_critics)]
+    members = [jax.tree.map(lambda leaf, n=n: leaf[n], params) for n in range(config.num_critics)]
     return jnp.stack([critic.apply(member, joint) for member in members])
 
 

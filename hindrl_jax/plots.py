@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,34 +16,74 @@ _MEAN, _SEED, _DEMO = "#1f5fa8", "#9dbfe3", "#c77b00"
 
 def save_curve(result: Result, path: Path) -> None:
     """Draws success and episode length over training, one thin line per seed and their mean, as a PNG."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    cloning = result.config.algo == "bc"
-    rows = np.asarray([(row.updates if cloning else row.env_steps, row.success, row.episode_length) for row in result.rows], np.float64).reshape(
-        -1, len(result.seeds), 3
-    )
-    x = rows[:, 0, 0]
+    plt = _pyplot()
+    x, success, length = _curves(result)
     figure, axes = plt.subplots(2, 1, figsize=(7, 5.5), sharex=True, height_ratios=(3, 2), layout="constrained")
-    for axis, values in zip(axes, (100 * rows[:, :, 1], rows[:, :, 2]), strict=True):
+    for axis, values in zip(axes, (success, length), strict=True):
         if len(result.seeds) > 1:
             axis.plot(x, values, color=_SEED, linewidth=0.9)
         axis.plot(x, values.mean(axis=1), color=_MEAN, linewidth=2, marker="o", markersize=3, label=_mean_label(result))
-        axis.grid(alpha=0.25)
-        axis.spines[["top", "right"]].set_visible(False)
     lengths = np.asarray(result.guidance.demonstrations.lengths)
     axes[1].axhline(lengths.mean(), color=_DEMO, linestyle="--", linewidth=1, label="demonstrations")
-    axes[0].axhline(95, color="0.6", linestyle=":", linewidth=1)
-    axes[0].set(ylim=(-3, 103), ylabel="success, %")
     axes[0].legend(loc="lower right", frameon=False)
-    axes[1].set(ylim=(0, result.env.horizon * 1.05), ylabel="episode length, steps", xlabel="gradient steps" if cloning else "environment steps")
+    axes[1].set(ylim=(0, result.env.horizon * 1.05), ylabel="episode length, steps", xlabel=_x_label(result))
     axes[1].legend(loc="lower left", frameon=False)
-    demos = f"{lengths.shape[1]} demonstration{'s' if lengths.shape[1] > 1 else ''}"
-    axes[0].set_title(f"{result.env.name}, {result.config.algo}, {demos}", loc="left")
+    axes[0].set_title(_title(result), loc="left")
+    _tidy(axes)
     figure.savefig(path, dpi=130)
     plt.close(figure)
+
+
+def save_sweep(parts: Sequence[Result], labels: Sequence[str], path: Path) -> None:
+    """Draws success over training for each setting of a sweep: the mean of its seeds, and thinly each seed, as a PNG."""
+    plt = _pyplot()
+    colours = plt.get_cmap("viridis")(np.linspace(0.0, 0.9, len(parts)))
+    figure, axis = plt.subplots(figsize=(8, 4.5), layout="constrained")
+    for part, label, colour in zip(parts, labels, colours, strict=True):
+        x, success, _ = _curves(part)
+        axis.plot(x, success, color=colour, linewidth=0.6, alpha=0.35)
+        axis.plot(x, success.mean(axis=1), color=colour, linewidth=2, marker="o", markersize=3, label=label)
+    axis.set(xlabel=_x_label(parts[0]))
+    axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize="small")
+    seeds = f", mean of {len(parts[0].seeds)} seeds" if len(parts[0].seeds) > 1 else ""
+    axis.set_title(_title(parts[0]) + seeds, loc="left")
+    _tidy([axis])
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def _pyplot() -> Any:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    return pyplot
+
+
+def _curves(result: Result) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Steps (evaluations,), success in percent and episode length (evaluations, S)."""
+    rows = [(row.updates if result.config.algo == "bc" else row.env_steps, 100 * row.success, row.episode_length) for row in result.rows]
+    table = np.asarray(rows, np.float64).reshape(-1, len(result.seeds), 3)
+    return table[:, 0, 0], table[:, :, 1], table[:, :, 2]
+
+
+def _tidy(axes: Sequence[Any]) -> None:
+    """What all pictures share; the first axis shows success."""
+    axes[0].axhline(95, color="0.6", linestyle=":", linewidth=1)
+    axes[0].set(ylim=(-3, 103), ylabel="success, %")
+    for axis in axes:
+        axis.grid(alpha=0.25)
+        axis.spines[["top", "right"]].set_visible(False)
+
+
+def _x_label(result: Result) -> str:
+    return "gradient steps" if result.config.algo == "bc" else "environment steps"
+
+
+def _title(result: Result) -> str:
+    demos = result.guidance.demonstrations.lengths.shape[1]
+    return f"{result.env.name}, {result.config.algo}, {demos} demonstration{'s' if demos > 1 else ''}"
 
 
 def _mean_label(result: Result) -> str:

@@ -30,7 +30,7 @@ from experts.recording import RecordableEnvironment, play
 from hindrl_jax import plots, rollout
 from hindrl_jax import train as training
 from hindrl_jax.agent import InputScale
-from hindrl_jax.config import TrainConfig
+from hindrl_jax.config import TrainConfig, with_values
 from hindrl_jax.errors import UserError
 from hindrl_jax.experiment import Result, Row
 from hindrl_jax.goals import GoalTable
@@ -39,6 +39,7 @@ from hindrl_jax.types import action_to_env
 
 CONFIG, METRICS, SUMMARY, PARAMETERS = "config.json", "metrics.csv", "summary.json", "parameters.npz"
 CURVE, EPISODE = "curve.png", "episode.gif"
+SWEEP, SWEEP_CURVES = "sweep.csv", "sweep.png"
 FROM_PYTHON = "given from Python"
 _FILES = (CONFIG, METRICS, SUMMARY, PARAMETERS, CURVE, EPISODE)
 _ROW_FIELDS = [field.name for field in dataclasses.fields(Row) if field.name != "metrics"]
@@ -164,9 +165,9 @@ class RunWriter:
             _write_atomically(self.path / CONFIG, json.dumps(self.spec.to_json(), indent=2) + "\n")
         self.started = True
 
-    def report(self, result: Result) -> None:
-        """Appends the evaluations that are new since the last call to `metrics.csv`."""
-        rows = result.rows[self.rows_written :]
+    def report(self, rows: list[Row]) -> None:
+        """Appends to `metrics.csv` those of the run's evaluations so far that are new since the last call."""
+        rows = rows[self.rows_written :]
         if not rows:
             return
         fields = [*_ROW_FIELDS, *rows[0].metrics]
@@ -179,16 +180,54 @@ class RunWriter:
                 writer.writerow({name: f"{value:.6g}" if isinstance(value, float) else value for name, value in values.items()})
         self.rows_written += len(rows)
 
-    def finish(self, result: Result) -> dict[str, Any]:
-        """Writes the parameters, the summary, the curve and the film of an episode; returns the summary."""
-        self.report(result)
+    def finish(self, result: Result, *, film: bool = True) -> dict[str, Any]:
+        """Writes the parameters, the summary, the curve and (unless `film` is off) the film of an episode; returns the summary."""
+        self.report(result.rows)
         summary = summarise(result)
         with _disk_trouble(self.path):
             _save_parameters(self.path / PARAMETERS, result)
             _write_atomically(self.path / SUMMARY, json.dumps(summary, indent=2) + "\n")
             plots.save_curve(result, self.path / CURVE)
-        load_run(self.path).render(self.path / EPISODE)
+        if film:
+            load_run(self.path).render(self.path / EPISODE)
         return summary
+
+
+class SweepWriter:
+    """Writes a sweep: a run's directory for each setting, `sweep.csv` with a line for each, and their curves in `sweep.png`."""
+
+    def __init__(self, path: Path, spec: RunSpec, settings: list[dict[str, float]], *, overwrite: bool):
+        """Only checks, as `RunWriter` does; `settings` are the swept fields and their values, in order of the runs."""
+        self.path, self.settings = path, settings
+        folders = [",".join(f"{name}={value:g}" for name, value in setting.items()) for setting in settings]
+        specs = [dataclasses.replace(spec, config=with_values(spec.config, setting)) for setting in settings]
+        self.runs = [RunWriter(path / folder, spec, overwrite=overwrite) for folder, spec in zip(folders, specs, strict=True)]
+
+    def finish(self, result: Result) -> list[dict[str, str]]:
+        """Finishes the run of each setting, then writes the table and the picture; returns the rows of the table."""
+        num_seeds = len(result.seeds) // len(self.runs)
+        parts = [result.part(slice(index * num_seeds, (index + 1) * num_seeds)) for index in range(len(self.runs))]
+        table = []
+        for setting, writer, part in zip(self.settings, self.runs, parts, strict=True):
+            seeds = writer.finish(part, film=False)["seeds"]
+            final, steps = (
+                [seed["final_success"] for seed in seeds],
+                [seed["env_steps_to_95"] for seed in seeds if seed["env_steps_to_95"] is not None],
+            )
+            outcome = {
+                "95% reached": f"{len(steps)} of {num_seeds}",
+                "median steps": f"{np.median(steps):,.0f}" if steps else "never",
+                "mean final": f"{np.mean(final):.0%}",
+                "worst": f"{min(final):.0%}",
+            }
+            table.append({name: f"{value:g}" for name, value in setting.items()} | outcome)
+        with _disk_trouble(self.path):
+            with (self.path / SWEEP).open("w", newline="") as file:
+                writer = csv.DictWriter(file, list(table[0]))
+                writer.writeheader()
+                writer.writerows(table)
+            plots.save_sweep(parts, [writer.path.name for writer in self.runs], self.path / SWEEP_CURVES)
+        return table
 
 
 def save_run(path: str | os.PathLike[str], result: Result, *, demos: str = FROM_PYTHON, overwrite: bool = False) -> dict[str, Any]:

@@ -12,10 +12,12 @@ import sys
 from pathlib import Path
 
 import h5py
+import jax
 import numpy as np
 import pytest
 
 from hindrl_jax import cli
+from hindrl_jax.runs import load_run
 
 TINY = shlex.split(
     "--num-envs 2 --learning-starts 200 --steps 260 --eval-every 40 --eval-episodes 3 --updates-per-iteration 1 "
@@ -89,6 +91,48 @@ def test_config_runs_again_and_other_flags_change_it(run, tmp_path):
             np.testing.assert_array_equal(first[name], second[name])
     spec, _ = cli._parse_train(["--config", str(run / "config.json"), "--learning-rate", "0.5", "--seeds", "1"])
     assert (spec.config.agent.learning_rate, spec.seeds, spec.config.batch.batch_size) == (0.5, (5,), 16)
+
+
+def test_sweep_leaves_a_run_for_each_setting(tmp_path, capsys):
+    out = tmp_path / "sweep"
+    cli.main(["sweep", "--over", "learning-rate=1e-3,2e-3", "--over", "bc_weight=0.1", "--seeds", "2", "--seed", "5", "--out", str(out), *TINY])
+    printed = capsys.readouterr().out
+    assert "2 seeds from 5, 2 settings" in printed
+    folders = ["learning_rate=0.001,bc_weight=0.1", "learning_rate=0.002,bc_weight=0.1"]
+    assert sorted(file.name for file in out.iterdir()) == [*folders, "sweep.csv", "sweep.png"]
+    rows = list(csv.DictReader((out / "sweep.csv").read_text().splitlines()))
+    assert [(row["learning_rate"], row["bc_weight"], row["95% reached"]) for row in rows] == [("0.001", "0.1", "0 of 2"), ("0.002", "0.1", "0 of 2")]
+    for folder, rate in zip(folders, (1e-3, 2e-3), strict=True):
+        run = load_run(out / folder)
+        assert (run.spec.seeds, run.spec.config.agent.learning_rate, run.spec.config.agent.bc_weight) == ((5, 6), rate, 0.1)
+        assert jax.tree.leaves(run.policies)[0].shape[0] == 2
+        metrics = list(csv.DictReader((out / folder / "metrics.csv").read_text().splitlines()))
+        assert [(row["seed"], row["env_steps"]) for row in metrics] == [("5", "240"), ("6", "240"), ("5", "260"), ("6", "260")]
+    first, second = (np.load(out / folder / "parameters.npz")["policy/params/Dense_0/kernel"] for folder in folders)
+    assert np.abs(first - second).max() > 0.0
+    assert "already holds a run" in refusal(capsys, "sweep", "--over", "learning_rate=1e-3,2e-3", "--over", "bc_weight=0.1", "--out", out, *TINY)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["sweep"], "--over is missing"),
+        (["sweep", "--over", "batch_size=1,2"], "'batch_size' cannot be swept"),
+        (["sweep", "--over", "gama=0.9"], "did you mean 'gamma'?"),
+        (["sweep", "--over", "gamma"], "write for example --over gamma=0.1,0.2"),
+        (["sweep", "--over", "gamma=0.9,x"], "write for example --over gamma=0.1,0.2"),
+        (["sweep", "--over", "gamma=0.9,0.9"], "a value is listed twice"),
+        (["sweep", "--over", "gamma=0.9", "--over", "gamma=0.8"], "gamma is given twice"),
+        (["sweep", "--over", "gamma=0.9,1.5"], "gamma = 1.5 is not usable"),
+        (["train", "--host", "0"], "add --distributed"),
+        (["train", "--distributed", "--host", "0"], "belong together"),
+        (["train", "--distributed"], "cannot join the other hosts"),
+    ],
+)
+def test_sweeps_and_hosts_that_make_no_sense_are_refused(arguments, message, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert message in refusal(capsys, *arguments, "--out", out, *TINY)
+    assert not out.exists()
 
 
 def test_eval_and_render_read_the_run_back(run, tmp_path, capsys):

@@ -3,11 +3,12 @@
 import dataclasses
 from types import SimpleNamespace
 
+import chex
 import numpy as np
 import pytest
 
 import hindrl_jax as hindrl
-from hindrl_jax.config import AgentConfig, BatchConfig, TrainConfig
+from hindrl_jax.config import SWEEPABLE, AgentConfig, BatchConfig, GoalConfig, TrainConfig, sweepable_value, with_values
 from hindrl_jax.experiment import Result, Row
 
 ENV = hindrl.make("FixedGridPickAndPlace", size=4, random_box_size=1, horizon=20)
@@ -37,14 +38,14 @@ def test_summary_takes_the_first_evaluation_at_95_percent():
     rows = [row(1, 100, 0.94), row(2, 100, 0.5), row(1, 200, 0.95), row(2, 200, 0.6), row(1, 300, 0.9), row(2, 300, 0.7)]
     result = Result(
         env=ENV,
-        config=CONFIG,
+        configs=(CONFIG, CONFIG),
         seeds=(1, 2),
         guidance=None,
         state=None,
         rows=rows,
         compile_seconds=1.0,
         train_seconds=3.0,
-        steps_done=300,
+        env_steps=300,
         final_success=np.array([0.91, 0.8]),
         final_length=np.array([8.0, 10.0]),
     )
@@ -64,6 +65,59 @@ def test_a_run_is_as_long_as_asked_and_seeds_do_not_depend_on_each_other(demonst
     alone = hindrl.fit(ENV, demonstrations, CONFIG, seeds=[4])
     for name, value in alone.rows[0].metrics.items():
         np.testing.assert_allclose(value, together.rows[1].metrics[name], rtol=1e-3, atol=1e-5, err_msg=name)
+
+
+# Every sweepable field, with a value other than CONFIG's, in a config where each of them has a say.
+OTHER_VALUES = dict(
+    union_sampling_ratio=0.9,
+    gamma=0.7,
+    k=2.0,
+    learning_rate=3e-3,
+    final_learning_rate=1e-3,
+    target_update_rate=0.2,
+    actor_average_rate=0.5,
+    initial_alpha=0.1,
+    target_entropy=-2.0,
+    final_target_entropy=-4.0,
+    bc_weight=0.5,
+)
+
+
+def test_configs_that_differ_in_numbers_share_one_program(demonstrations):
+    """Each run is what it would be alone, with its numbers as constants of the program."""
+    assert OTHER_VALUES.keys() == SWEEPABLE.keys()
+    config = dataclasses.replace(
+        CONFIG,
+        batch=dataclasses.replace(CONFIG.batch, hindrl_sampling_strategy="joint_union", num_sampled_goals=1.0),
+        goal=GoalConfig(m=2),
+        agent=dataclasses.replace(CONFIG.agent, final_learning_rate=1e-4),
+    )
+    other = with_values(config, OTHER_VALUES)
+    assert all(sweepable_value(config, name) != sweepable_value(other, name) for name in SWEEPABLE)
+    together = hindrl.fit(ENV, demonstrations, [config, other], seeds=[3, 3])
+    alone = [hindrl.fit(ENV, demonstrations, each, seeds=[3]) for each in (config, other)]
+    for index, single in enumerate(alone):
+        part = together.part(slice(index, index + 1))
+        assert (part.config, part.seeds, len(part.rows)) == (single.config, (3,), len(single.rows))
+        for name, value in single.rows[0].metrics.items():
+            np.testing.assert_allclose(part.rows[0].metrics[name], value, rtol=1e-3, atol=1e-5, err_msg=name)
+        chex.assert_trees_all_close(part.state.agent, single.state.agent, rtol=1e-3, atol=1e-4)
+        chex.assert_trees_all_close(part.guidance.epsilon, single.guidance.epsilon, rtol=1e-5)
+    metrics = [single.rows[0].metrics for single in alone]
+    assert all(metrics[0][name] != metrics[1][name] for name in metrics[0] if name != "batch/reward")
+
+
+@pytest.mark.parametrize(
+    ("configs", "message"),
+    [
+        ([CONFIG], "1 configs for 2 seeds"),
+        ([CONFIG, dataclasses.replace(CONFIG, num_envs=4)], "may differ only in union_sampling_ratio, gamma"),
+        ([CONFIG, with_values(CONFIG, {"final_learning_rate": 1e-3})], "final_learning_rate is None in some"),
+    ],
+)
+def test_configs_that_need_programs_of_their_own_are_refused(configs, message, demonstrations):
+    with pytest.raises(hindrl.UserError, match=message):
+        hindrl.fit(ENV, demonstrations, configs, seeds=[0, 1])
 
 
 def test_cloning_takes_as_many_updates_as_asked_and_no_environment_step(demonstrations):
