@@ -1,10 +1,13 @@
 """Losses of TQC (Kuznetsov et al., 2020) and of learning from demonstrations, as functions of arrays.
 
-Atoms (quantiles) lie on the leading axes and the batch on the last: on a CPU that layout, not the arithmetic, decides the speed.
+Atoms (quantiles) lie on the leading axes and the batch on the last: on a CPU that layout, not the arithmetic, decides the speed. Truncation and
+the quantile Huber loss come in two forms with equal results, chosen where the program is compiled: loops over the atoms, which keep a CPU's cache
+and vector units busy, and whole-array operations, which are few launches on a GPU.
 """
 
 from __future__ import annotations
 
+import functools
 from typing import Literal
 
 import jax
@@ -21,8 +24,7 @@ def quantile_midpoints(num_quantiles: int) -> Array:
 def drop_largest(atoms: Array, num_dropped: int) -> Array:
     """Removes the `num_dropped` largest atoms of each column: the truncation of TQC (2020, eq. 9).
 
-    Every atom is carried past `num_dropped` registers that keep the largest values seen; what falls out at the end is kept. Nothing
-    needs to be sorted, since the loss is symmetric in the target atoms.
+    Nothing needs to be sorted, since the loss is symmetric in the target atoms.
 
     Args:
       atoms: (M, B).
@@ -37,6 +39,16 @@ def drop_largest(atoms: Array, num_dropped: int) -> Array:
     """
     if num_dropped == 0:
         return atoms
+    loop, sort = (functools.partial(form, num_dropped=num_dropped) for form in (_drop_by_registers, _drop_by_sorting))
+    return jax.lax.platform_dependent(atoms, cpu=loop, default=sort)
+
+
+def _drop_by_sorting(atoms: Array, *, num_dropped: int) -> Array:
+    return jnp.sort(atoms, axis=0)[: atoms.shape[0] - num_dropped]
+
+
+def _drop_by_registers(atoms: Array, *, num_dropped: int) -> Array:
+    """Carries every atom past `num_dropped` registers that keep the largest values seen; what falls out at the end is kept."""
 
     def carry_past(largest: tuple[Array, ...], atom: Array) -> tuple[tuple[Array, ...], Array]:
         registers = []
@@ -50,8 +62,23 @@ def drop_largest(atoms: Array, num_dropped: int) -> Array:
     return fallen_out[num_dropped:]
 
 
-def _quantile_huber_sums(quantiles: Array, targets: Array) -> tuple[Array, Array]:
-    """One pass over the target atoms that yields the loss and its gradient: (B,) and (..., Q, B), both averaged over atoms."""
+def _quantile_huber_and_gradient(quantiles: Array, targets: Array) -> tuple[Array, Array]:
+    """The loss (..., B) and its gradient (..., Q, B), both averaged over atoms."""
+    return jax.lax.platform_dependent(quantiles, targets, cpu=_quantile_huber_in_one_pass, default=_quantile_huber_of_all_pairs)
+
+
+def _quantile_huber_of_all_pairs(quantiles: Array, targets: Array) -> tuple[Array, Array]:
+    num_quantiles, num_targets = quantiles.shape[-2], targets.shape[0]
+    midpoints = quantile_midpoints(num_quantiles).reshape((1,) * (quantiles.ndim - 1) + (num_quantiles, 1)).astype(quantiles.dtype)
+    error = targets.reshape((num_targets,) + (1,) * (quantiles.ndim - 1) + (-1,)) - quantiles[None]  # (M, ..., Q, B)
+    clipped = jnp.clip(error, -1.0, 1.0)
+    weighted = jnp.where(error < 0.0, 1.0 - midpoints, midpoints) * clipped
+    scale = 1.0 / (num_quantiles * num_targets)
+    return scale * jnp.sum(weighted * (error - 0.5 * clipped), axis=(0, -2)), -scale * jnp.sum(weighted, axis=0)
+
+
+def _quantile_huber_in_one_pass(quantiles: Array, targets: Array) -> tuple[Array, Array]:
+    """A scan over the target atoms that sums up loss and gradient together."""
     num_quantiles, num_targets = quantiles.shape[-2], targets.shape[0]
     midpoints = quantile_midpoints(num_quantiles).reshape((1,) * (quantiles.ndim - 2) + (num_quantiles, 1)).astype(quantiles.dtype)
 
@@ -86,11 +113,11 @@ def quantile_huber(quantiles: Array, targets: Array) -> Array:
       >>> quantile_huber(jnp.zeros((25, 1)), jnp.ones((46, 1))).tolist()
       [0.25]
     """
-    return _quantile_huber_sums(quantiles, targets)[0]
+    return _quantile_huber_and_gradient(quantiles, targets)[0]
 
 
 def _quantile_huber_forward(quantiles: Array, targets: Array) -> tuple[Array, tuple[Array, Array]]:
-    loss, gradient = _quantile_huber_sums(quantiles, targets)
+    loss, gradient = _quantile_huber_and_gradient(quantiles, targets)
     return loss, (gradient, targets)
 
 

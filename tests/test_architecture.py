@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-STANDARD_LIBRARY = {"__future__", "abc", "collections", "dataclasses", "enum", "functools", "itertools", "math", "types", "typing"}
+STANDARD_LIBRARY = {"__future__", "abc", "collections", "copy", "dataclasses", "enum", "functools", "itertools", "math", "types", "typing"}
 PURE = STANDARD_LIBRARY | {"jax", "flax", "optax", "chex"}
 
 # Module of the core -> the modules of the core that it may import.

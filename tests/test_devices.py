@@ -68,9 +68,9 @@ def test_two_processes_give_what_one_gives(tmp_path):
         port = probe.getsockname()[1]
     together = ["--distributed", "--coordinator", f"127.0.0.1:{port}", "--num-hosts", 2]
     runs = [
-        hindrl("train", "--out", tmp_path / "two", *tiny.split(), *together, "--host", 0),
-        hindrl("train", "--out", tmp_path / "two", *tiny.split(), *together, "--host", 1),
-        hindrl("train", "--out", tmp_path / "one", *tiny.split()),
+        hindrl("train", "--out", tmp_path / "two", *tiny.split(), "--buffer-size", 2000, *together, "--host", 0),
+        hindrl("train", "--out", tmp_path / "two", *tiny.split(), "--buffer-size", 2000, *together, "--host", 1),
+        hindrl("train", "--out", tmp_path / "one", *tiny.split(), "--buffer-size", 2000),
     ]
     outputs = [run.communicate(timeout=300) for run in runs]
     assert [run.returncode for run in runs] == [0, 0, 0], outputs

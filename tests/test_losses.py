@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
+from hindrl_jax import losses
 from hindrl_jax.losses import behaviour_cloning, drop_largest, entropy_coefficient, quantile_huber, quantile_midpoints, target_atoms
 
 
@@ -62,7 +63,11 @@ def plain_quantile_huber(quantiles, targets):
     return jnp.mean(jnp.abs(midpoints - (error < 0.0)) * huber, axis=(1, 2))
 
 
-def test_loss_and_gradient_are_those_of_the_plain_formula():
+@pytest.mark.parametrize("form", [losses._quantile_huber_in_one_pass, losses._quantile_huber_of_all_pairs])
+def test_loss_and_gradient_are_those_of_the_plain_formula(form, monkeypatch):
+    """Both forms, though only one of them runs on this machine's kind of device."""
+    monkeypatch.setattr(losses, "_quantile_huber_and_gradient", form)
+    jax.clear_caches()
     rng = np.random.default_rng(0)
     with jax.enable_x64(True):
         # Errors of either sign on both sides of 1, and weights that differ between critics and rows.
@@ -89,6 +94,14 @@ def test_drop_largest_is_that_of_a_sort(atoms, num_dropped):
     atoms = np.array(atoms, np.float32).T  # integers from a small range: ties and negative numbers abound
     expected = np.sort(atoms, axis=0)[: 6 - num_dropped]
     np.testing.assert_array_equal(np.sort(jitted_drop(jnp.asarray(atoms), num_dropped), axis=0), expected)
+
+
+@pytest.mark.parametrize("form", [losses._drop_by_registers, losses._drop_by_sorting])
+@pytest.mark.parametrize("num_dropped", [1, 2, 5])
+def test_both_forms_of_truncation_keep_the_same_atoms(form, num_dropped):
+    atoms = np.random.default_rng(0).integers(-3, 3, size=(6, 11)).astype(np.float32)
+    expected = np.sort(atoms, axis=0)[: 6 - num_dropped]
+    np.testing.assert_array_equal(np.sort(form(jnp.asarray(atoms), num_dropped=num_dropped), axis=0), expected)
 
 
 def test_drop_largest_by_hand():
