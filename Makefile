@@ -1,8 +1,9 @@
 # Works on a fresh machine with Python >= 3.11 and make. Choose the interpreter with e.g. `make train PYTHON=python3.12`.
 PYTHON ?= python3
 PIP = .venv/bin/python -m pip install -q --disable-pip-version-check
+PEERS_PIP = benchmarks/$(PIP) -r benchmarks/requirements-peers.txt
 
-.PHONY: train test test-slow lint clean
+.PHONY: train test test-slow lint bench clean
 
 train: .venv/.installed  ## one demonstration, one seed, about a minute
 	.venv/bin/hindrl train --env FixedGridPickAndPlace --algo hindrl --demos 1 --seeds 1 --out runs/quickstart --overwrite
@@ -17,8 +18,11 @@ lint: .venv/.installed-test
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 
+bench: .venv/.installed benchmarks/.venv/.installed  ## writes benchmarks/RESULTS.md, about 20 minutes; e.g. make bench BENCH="--only seeds startup"
+	.venv/bin/python -m benchmarks.run $(BENCH)
+
 clean:  ## everything that can be made again; results in runs/ stay
-	rm -rf .venv build dist .pytest_cache .hypothesis .ruff_cache *.egg-info
+	rm -rf .venv benchmarks/.venv build dist .pytest_cache .hypothesis .ruff_cache *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The stamp files say which lock was installed last, so that a second call installs nothing.
@@ -34,4 +38,11 @@ clean:  ## everything that can be made again; results in runs/ stay
 .venv/.installed-test: requirements-test.lock .venv/.installed
 	@echo "installing the tests' packages into .venv ..."
 	@$(PIP) -r requirements-test.lock
+	@touch $@
+
+# torch's CPU build is not on PyPI; pip may know a place that has it, else it is fetched from its makers.
+benchmarks/.venv/.installed: benchmarks/requirements-peers.txt
+	@echo "installing the benchmark's peers into benchmarks/.venv ..."
+	@$(PYTHON) -m venv benchmarks/.venv
+	@$(PEERS_PIP) 2>/dev/null || $(PEERS_PIP) --extra-index-url https://download.pytorch.org/whl/cpu
 	@touch $@

@@ -17,7 +17,7 @@ import time
 from typing import Any
 
 __version__ = "0.1.0"
-STARTED = time.perf_counter()  # this package loads before the large ones it uses, so that start-up can be timed
+STARTED = time.perf_counter()  # this package loads before the large ones it uses: `hindrl train` says how long its start took
 
 # Loaded on first use: `envs` and `experts` import the core below this package, and the names here import `envs` and `experts`.
 _EXPORTS = {

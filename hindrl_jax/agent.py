@@ -150,33 +150,33 @@ class _Columns:
     reward: Array  # (B,)
     discount: Array  # (B,)
     is_demonstration: Array  # (B,) bool
+    noise: Array  # (A, B) standard normal, for the sampled action
+    next_noise: Array  # (A, B) the same for the next action
 
 
 _BLOCK_BYTES = 2**19
 
 
 def _num_blocks(batch_size: int, config: AgentConfig) -> int:
-    """Into how many equal blocks a batch is cut on a CPU, so that the activations of one layer stay in a core's cache; elsewhere 1."""
+    """Into how many equal blocks a batch is cut on a CPU, so that the activations of one layer stay in a core's cache; elsewhere 1.
+
+    Also 1 for a batch size that has no divisor near the number needed.
+    """
     if jax.default_backend() != "cpu":
         return 1
     needed = -(-4 * max(config.net_arch) * batch_size // _BLOCK_BYTES)
     return next((blocks for blocks in range(needed, 2 * needed) if batch_size % blocks == 0), 1)
 
 
-def _mean_over_blocks(key: Array, function: Callable[[Array, _Columns], Any], columns: _Columns, num_blocks: int) -> Any:
-    """The mean of function(key, block) over equal blocks of columns; for means over columns, that is function(key, columns) itself."""
+def _mean_over_blocks(function: Callable[[_Columns], Any], columns: _Columns, num_blocks: int) -> Any:
+    """The mean of function(block) over equal blocks of columns; for means over columns, that is function(columns) itself."""
     if num_blocks == 1:
-        return function(key, columns)
+        return function(columns)
 
     def cut(array: Array) -> Array:  # (..., B) -> (blocks, ..., B / blocks)
         return jnp.moveaxis(array.reshape((*array.shape[:-1], num_blocks, -1)), -2, 0)
 
-    def one_block(key: Array, block: _Columns) -> tuple[Array, Any]:
-        key, key_block = jax.random.split(key)
-        return key, function(key_block, block)
-
-    _, values = jax.lax.scan(one_block, key, jax.tree.map(cut, columns))
-    return jax.tree.map(lambda value: jnp.mean(value, axis=0), values)
+    return jax.tree.map(lambda value: jnp.mean(value, axis=0), jax.lax.map(function, jax.tree.map(cut, columns)))
 
 
 def update(
@@ -211,10 +211,12 @@ def update(
         reward=batch.reward,
         discount=batch.discount,
         is_demonstration=batch.is_demonstration,
+        noise=jax.random.normal(key_actor, action.shape),
+        next_noise=jax.random.normal(key_next, action.shape),
     )
 
-    def critic_gradient(key: Array, block: _Columns) -> tuple[Params, Metrics]:
-        next_action, next_log_prob = apply_actor(state.actor, block.next_inputs, config, action_dim=action_dim).sample(key)
+    def critic_gradient(block: _Columns) -> tuple[Params, Metrics]:
+        next_action, next_log_prob = apply_actor(state.actor, block.next_inputs, config, action_dim=action_dim).at(block.next_noise)
         next_atoms = apply_critics(state.target_critics, block.next_inputs, next_action, config)
         targets = target_atoms(
             next_atoms.reshape(-1, next_atoms.shape[-1]),
@@ -231,13 +233,13 @@ def update(
 
         return jax.grad(loss, has_aux=True)(state.critics)
 
-    gradient, critic_metrics = _mean_over_blocks(key_next, critic_gradient, columns, num_blocks)
+    gradient, critic_metrics = _mean_over_blocks(critic_gradient, columns, num_blocks)
     critics, critic_optimiser = _descend(gradient, state.critic_optimiser, state.critics, schedule.learning_rate)
 
-    def actor_gradient(key: Array, block: _Columns) -> tuple[Params, Metrics]:
+    def actor_gradient(block: _Columns) -> tuple[Params, Metrics]:
         def loss(actor: Params) -> tuple[Array, Metrics]:
             distribution = apply_actor(actor, block.inputs, config, action_dim=action_dim)
-            action, log_prob = distribution.sample(key)
+            action, log_prob = distribution.at(block.noise)
             value = jnp.mean(mean_return(critics, block.inputs, action, config))
             cloned = distribution.mode if config.bc_action == "mean" else action
             bc = behaviour_cloning(cloned, block.action, block.is_demonstration, form=config.bc_loss)
@@ -247,7 +249,7 @@ def update(
 
         return jax.grad(loss, has_aux=True)(state.actor)
 
-    gradient, actor_metrics = _mean_over_blocks(key_actor, actor_gradient, columns, num_blocks)
+    gradient, actor_metrics = _mean_over_blocks(actor_gradient, columns, num_blocks)
     actor, actor_optimiser = _descend(gradient, state.actor_optimiser, state.actor, schedule.learning_rate)
 
     loss_alpha, gradient = jax.value_and_grad(entropy_coefficient)(

@@ -26,7 +26,7 @@ from rich.table import Table
 
 from experts.recording import RecordableEnvironment
 from hindrl_jax import STARTED, __version__
-from hindrl_jax.config import SWEEPABLE, TrainConfig, with_values
+from hindrl_jax.config import SWEEPABLE, TrainConfig, with_values, without_effect
 from hindrl_jax.datasets import describe_demonstrations, load_demonstrations, read_states, save_demonstrations
 from hindrl_jax.errors import UserError
 from hindrl_jax.experiment import Result, fit, record_demonstrations
@@ -54,7 +54,7 @@ class TrainOptions:
     seed: int | None = None
     """The first seed; the others follow it (default: 0)."""
     out: Path | None = None
-    """Directory of the run (default: runs/ENV_ALGO_TIME)."""
+    """Directory of the run (default: runs/ENV_ALGO_TIME, for a sweep runs/ENV_ALGO_sweep_TIME)."""
     overwrite: bool = False
     """Replace a run that is already there."""
     distributed: bool = False
@@ -80,12 +80,12 @@ class SweepOptions(TrainOptions):
 def _train(arguments: list[str]) -> None:
     """Train policies from demonstrations."""
     spec, options = _parse_train(arguments)
+    out = options.out or _default_out(spec)
+    writer = RunWriter(out, spec, overwrite=options.overwrite)
     with _hosts(options) as writes:
-        out = options.out or _default_out(spec)
-        writers = [RunWriter(out, spec, overwrite=options.overwrite)] if writes else []
-        result = _fit(spec, [spec.config], writers)
+        result = _fit(spec, [spec.config], [writer] if writes else [])
         if writes:
-            summary = writers[0].finish(result)
+            summary = writer.finish(result)
             console.print(_summary_table(summary))
             console.print(_speed_line(summary))
             console.print(f"wrote {out}: config.json, metrics.csv, summary.json, curve.png, episode.gif, parameters.npz")
@@ -96,17 +96,29 @@ def _sweep(arguments: list[str]) -> None:
     spec, options = _parse_train(arguments, SweepOptions, "hindrl sweep")
     settings = list(_grid(options.over, spec.config))
     configs = [checked(lambda values=values: with_values(spec.config, values)) for values in settings]
+    out = options.out or _default_out(spec, "sweep")
+    writer = SweepWriter(out, spec, settings, overwrite=options.overwrite)
     with _hosts(options) as writes:
-        out = options.out or _default_out(spec, "sweep")
-        writer = SweepWriter(out, spec, settings, overwrite=options.overwrite) if writes else None
-        result = _fit(spec, configs, writer.runs if writer else [])
-        if writer:
-            table = Table(*settings[0], "95% reached", "median steps", "mean final", "worst", box=box.SIMPLE_HEAD)
-            for row in writer.finish(result):
-                table.add_row(*row.values())
-            console.print(table)
+        result = _fit(spec, configs, writer.runs if writes else [])
+        if writes:
+            console.print(_sweep_table(writer.finish(result), list(settings[0])))
             console.print(_speed_line(summarise(result)))
             console.print(f"wrote {out}: sweep.csv, sweep.png, and a run's directory for each setting")
+
+
+def _sweep_table(rows: Sequence[dict[str, Any]], swept: Sequence[str]) -> Table:
+    unit = next(name for name in rows[0] if name.startswith("median_")).split("_")[1]
+    table = Table(*swept, "95% reached", f"median {unit}", "mean final", "worst", box=box.SIMPLE_HEAD)
+    for row in rows:
+        median = row[f"median_{unit}_to_95"]
+        table.add_row(
+            *(f"{row[name]:g}" for name in swept),
+            f"{row['seeds_reaching_95']} of {row['seeds']}",
+            "never" if median is None else f"{median:,.0f}",
+            f"{row['mean_final_success']:.0%}",
+            f"{row['worst_final_success']:.0%}",
+        )
+    return table
 
 
 def _default_out(spec: RunSpec, *words: str) -> Path:
@@ -127,8 +139,11 @@ def _grid(over: Sequence[str], config: TrainConfig) -> Iterator[dict[str, float]
             values[name] = [float(value) for value in listed.split(",")]
         except ValueError:
             raise UserError(f"--over {given} is not a field and its values: write for example --over {name}=0.1,0.2") from None
-        if len(set(values[name])) < len(values[name]):
-            raise UserError(f"--over {given}: a value is listed twice")
+        if len(set(map(np.float32, values[name]))) < len(values[name]):
+            raise UserError(f"--over {given}: a value is listed twice (values are rounded to float32)")
+        reason = without_effect(config, name)
+        if reason:
+            raise UserError(f"--over {given} would change nothing: {reason}")
     if not values:
         raise UserError("--over is missing: say what to sweep, for example --over learning_rate=1e-4,3e-4,1e-3")
     return (dict(zip(values, combination, strict=True)) for combination in itertools.product(*values.values()))
@@ -144,18 +159,22 @@ def _hosts(options: TrainOptions) -> Iterator[bool]:
                 raise UserError(f"--{name.replace('_', '-')} is for training on several hosts: add --distributed, or drop it")
         yield True
         return
+    coordinator, num_hosts, host = given.values()
     if any(value is None for value in given.values()) and any(value is not None for value in given.values()):
         raise UserError("--coordinator, --num-hosts and --host belong together: give all three, or none where the cluster tells JAX")
+    if coordinator is not None and not re.fullmatch(r"\S+:\d+", coordinator):
+        raise UserError(f"--coordinator {coordinator} is not an address: write HOST:PORT")
+    if num_hosts is not None and not 0 <= host < num_hosts:
+        raise UserError(f"--host {host} is not one of --num-hosts {num_hosts}: count hosts from 0")
+    jax.config.update("jax_enable_preemption_service", False)  # it would take the signals that are meant to end the run
     try:
-        jax.distributed.initialize(options.coordinator, options.num_hosts, options.host)
+        jax.distributed.initialize(coordinator, num_hosts, host)
     except (RuntimeError, ValueError) as error:
         raise UserError(
             f"cannot join the other hosts ({str(error).splitlines()[0]}): give --coordinator HOST:PORT --num-hosts N --host I on each"
         ) from error
-    try:
-        yield jax.process_index() == 0
-    finally:
-        jax.distributed.shutdown()
+    yield jax.process_index() == 0
+    jax.distributed.shutdown()  # waits for the others; so after a failure, which they must notice, it is left out
 
 
 def _fit(spec: RunSpec, configs: Sequence[TrainConfig], writers: Sequence[RunWriter]) -> Result:
@@ -182,7 +201,7 @@ def _fit(spec: RunSpec, configs: Sequence[TrainConfig], writers: Sequence[RunWri
                     writer.start()
                 progress.console.print(f"compiled in {result.compile_seconds:.1f} s{_on_devices(result)}")
             if result.updates and not reported["updates"]:
-                progress.console.print(f"first update after {time.perf_counter() - STARTED:.1f} s")
+                progress.console.print(f"first updates after {time.perf_counter() - STARTED:.1f} s")
             for index, writer in enumerate(writers):
                 writer.report(result.rows_of(slice(index * num_seeds, (index + 1) * num_seeds)))
             if len(result.rows) > reported["rows"]:
@@ -202,8 +221,8 @@ def _fit(spec: RunSpec, configs: Sequence[TrainConfig], writers: Sequence[RunWri
 
 
 def _on_devices(result: Result) -> str:
-    devices = result.state.env_steps.sharding.device_set
-    return f" for {len(devices)} devices" if len(devices) > 1 else ""
+    used, available = len(result.state.env_steps.sharding.device_set), jax.device_count()
+    return "" if len(result.seeds) == 1 or available == 1 else f", on {used} of {available} devices"
 
 
 def _speed_line(summary: dict[str, Any]) -> str:
@@ -288,7 +307,7 @@ def _is_number(demos: str) -> bool:
 
 def _evaluation_line(rows: Sequence[Any]) -> str:
     success = [row.success for row in rows]
-    spread = f" (worst seed {min(success):4.0%})" if len(rows) > 1 else ""
+    spread = f" (worst {min(success):4.0%})" if len(rows) > 1 else ""
     return (
         f"{rows[0].env_steps:9,d} steps {rows[0].updates:8,d} updates {rows[0].seconds:7.1f} s   "
         f"success {np.mean(success):4.0%}{spread}   length {np.mean([row.episode_length for row in rows]):5.1f}"

@@ -215,6 +215,18 @@ def sweepable_value(config: TrainConfig, name: str) -> float | None:
     return getattr(getattr(config, SWEEPABLE[name]), name)
 
 
+def without_effect(config: TrainConfig, name: str) -> str | None:
+    """Why changing a field of `SWEEPABLE` would change nothing in this config, and what to do; None if it does have an effect."""
+    if config.algo == "bc" and name not in ("learning_rate", "final_learning_rate", "actor_average_rate"):
+        return "behaviour cloning does not use it: choose another algo"
+    relabelled = config.batch.num_sampled_goals > 0
+    if name == "union_sampling_ratio" and not (relabelled and config.batch.hindrl_sampling_strategy == "joint_union"):
+        return "only relabelling by joint_union uses it: choose --hindrl-sampling-strategy joint_union"
+    if name == "k" and (config.goal.m == 0 or not (relabelled or config.goal.epsilon_filtering)):
+        return "epsilon depends on it only for m > 0, and is used only for relabelling and the filter: add --m 5"
+    return None
+
+
 def with_values(config: TrainConfig, values: Mapping[str, Any]) -> TrainConfig:
     """The config with some fields of `SWEEPABLE` replaced, and checked.
 

@@ -16,17 +16,17 @@ _SEEDS = PartitionSpec("seed")
 
 
 def seed_mesh(num_seeds: int) -> Mesh:
-    """The devices that share S seeds: of one host as many as divide them evenly, of several hosts all.
+    """The devices that share S seeds: as many of each host as divide its seeds evenly.
 
     Raises:
-      UserError: if the seeds cannot be shared evenly between the devices of several hosts.
+      UserError: if the hosts cannot share the seeds evenly.
     """
-    devices = jax.devices()
-    if jax.process_count() == 1:
-        devices = devices[: max(n for n in range(1, len(devices) + 1) if num_seeds % n == 0)]
-    elif num_seeds % len(devices):
-        raise UserError(f"{num_seeds} runs cannot be shared evenly between {len(devices)} devices: make them a multiple of {len(devices)}")
-    return Mesh(np.asarray(devices), ("seed",))
+    hosts = jax.process_count()
+    if num_seeds % hosts:
+        raise UserError(f"{num_seeds} seeds cannot be shared evenly between {hosts} hosts: make --seeds a multiple of {hosts}")
+    of_each = [[device for device in jax.devices() if device.process_index == host] for host in range(hosts)]
+    used = max(n for n in range(1, min(map(len, of_each)) + 1) if num_seeds // hosts % n == 0)
+    return Mesh(np.asarray([device for devices in of_each for device in devices[:used]]), ("seed",))
 
 
 def over_seeds(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:

@@ -114,8 +114,8 @@ class Result:
         return [row for start in range(0, len(self.rows), len(self.seeds)) for row in self.rows[start : start + len(self.seeds)][runs]]
 
     def part(self, runs: slice) -> Result:
-        """The finished experiment as if it had been about some of its runs only. Times are still those of all of them."""
-        guidance, agent = jax.tree.map(lambda leaf: leaf[runs], (self.guidance, self.state.agent))
+        """The finished experiment as if about some of its runs only; but times, and all of the state except the agent, are those of all."""
+        guidance, agent = jax.tree.map(lambda leaf: leaf[runs], jax.device_get((self.guidance, self.state.agent)))
         return dataclasses.replace(
             self,
             configs=self.configs[runs],
@@ -194,7 +194,7 @@ def fit(
     started = time.perf_counter()
     programs = _Programs(env, configs, tables)
     seeds_on_devices, tables, values = spread((np.asarray(seeds, np.uint32), tables, programs.values), programs.mesh)
-    guidance, state, key = programs.start(seeds_on_devices, tables, values)
+    guidance, state, key = jax.block_until_ready(programs.start(seeds_on_devices, tables, values))
     compile_seconds = time.perf_counter() - started
     result = Result(env=env, configs=configs, seeds=tuple(seeds), guidance=guidance, state=state, rows=[], compile_seconds=compile_seconds)
     report(result)
@@ -214,7 +214,7 @@ def fit(
             result.env_steps += programs.chunk * config.num_envs
             result.updates += programs.chunk * config.updates_per_iteration
         if result.steps_done >= min(next_evaluation, config.steps):
-            key, evaluation = programs.evaluate(key, result.state.agent.average_actor, guidance)
+            key, evaluation = programs.evaluate(key, result.state.agent.average_actor, guidance, values)
             evaluation = gather(evaluation)
             result.train_seconds = time.perf_counter() - started
             averaged = {name: np.mean([chunk[name] for chunk in chunks_metrics], axis=0) for name in chunks_metrics[0]}
@@ -224,7 +224,7 @@ def fit(
         result.train_seconds = time.perf_counter() - started
         report(result)
 
-    _, fresh = programs.evaluate_fresh(key, result.state.agent.average_actor, guidance)
+    _, fresh = programs.evaluate_fresh(key, result.state.agent.average_actor, guidance, values)
     fresh = gather(fresh)
     result.final_success, result.final_length = fresh.success.mean(axis=1), fresh.length.mean(axis=1)
     if jax.process_count() > 1:
@@ -258,7 +258,7 @@ def _configs_per_seed(config: TrainConfig | Sequence[TrainConfig], seeds: Sequen
     swept = _swept_fields(configs)
     for other in configs[1:]:
         if with_traced_values(configs[0], {name: sweepable_value(other, name) for name in swept}) != other:
-            raise UserError(f"configs of one experiment may differ only in {', '.join(SWEEPABLE)}: run the others apart")
+            raise UserError(f"configs of one experiment may differ only in {', '.join(SWEEPABLE)}; these differ in more: run them apart")
     for name in swept:
         if any(sweepable_value(config, name) is None for config in configs):
             raise UserError(f"{name} is None in some configs and a number in others: give numbers only")
@@ -299,9 +299,10 @@ class _Programs:
             iterate = training.clone if cloning else training.learn
             return iterate(state, guidance, env=env, config=with_traced_values(config, values), num_iterations=self.chunk)
 
-        def evaluate(key: Array, actor: Any, guidance: Guidance, *, num_episodes: int) -> tuple[Array, Evaluation]:
+        def evaluate(key: Array, actor: Any, guidance: Guidance, values: dict[str, Array], *, num_episodes: int) -> tuple[Array, Evaluation]:
             key, key_play = jax.random.split(key)
-            return key, training.evaluate(key_play, actor, guidance, env=env, config=config, num_episodes=num_episodes)
+            actual = with_traced_values(config, values)
+            return key, training.evaluate(key_play, actor, guidance, env=env, config=actual, num_episodes=num_episodes)
 
         # Everything is traced from shapes, and each program is handed to a thread that compiles it while the next one is being traced.
         with ThreadPoolExecutor() as pool:
@@ -317,7 +318,7 @@ class _Programs:
             learning = compiled(program(learn, donate=True).trace(state, guidance, values))
             starting = compiled(traced, _RUN_ONCE)
             evaluating = {
-                num_episodes: compiled(program(functools.partial(evaluate, num_episodes=num_episodes)).trace(key, actor, guidance))
+                num_episodes: compiled(program(functools.partial(evaluate, num_episodes=num_episodes)).trace(key, actor, guidance, values))
                 for num_episodes in {config.eval_episodes, FRESH_EPISODES}
             }
             collecting = None if cloning else compiled(program(collect, donate=True).trace(state, guidance, values), _RUN_ONCE)

@@ -93,7 +93,10 @@ class ActionDistribution:
 
     def sample(self, key: Array) -> tuple[Array, Array]:
         """A reparameterised action (A, B) in (-1, 1) and its log-probability (B,)."""
-        noise = jax.random.normal(key, self.mean.shape)
+        return self.at(jax.random.normal(key, self.mean.shape))
+
+    def at(self, noise: Array) -> tuple[Array, Array]:
+        """The action (A, B) that standard normal noise (A, B) leads to, and its log-probability (B,)."""
         pre_tanh = self.mean + jnp.exp(self.log_std) * noise
         log_prob = -0.5 * jnp.square(noise) - self.log_std - 0.5 * jnp.log(2.0 * jnp.pi)
         # log(1 - tanh(x)^2), in the form that does not cancel for large |x|

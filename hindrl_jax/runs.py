@@ -147,8 +147,9 @@ class RunWriter:
         if there and not overwrite:
             raise UserError(f"{path} already holds a run ({', '.join(there)}): choose another --out, or replace it with --overwrite")
         existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
-        if not os.access(existing, os.W_OK):
-            raise UserError(f"cannot write {path} ({existing} is read-only): choose another --out")
+        if not existing.is_dir() or not os.access(existing, os.W_OK):
+            reason = "read-only" if existing.is_dir() else "a file"
+            raise UserError(f"cannot write {path} ({existing} is {reason}): choose another --out")
         self.rows_written = 0
         self.started = False
 
@@ -194,33 +195,39 @@ class RunWriter:
 
 
 class SweepWriter:
-    """Writes a sweep: a run's directory for each setting, `sweep.csv` with a line for each, and their curves in `sweep.png`."""
+    """Writes a sweep: a run's directory for each setting, `sweep.csv` with a row for each, and their curves in `sweep.png`."""
 
     def __init__(self, path: Path, spec: RunSpec, settings: list[dict[str, float]], *, overwrite: bool):
         """Only checks, as `RunWriter` does; `settings` are the swept fields and their values, in order of the runs."""
         self.path, self.settings = path, settings
-        folders = [",".join(f"{name}={value:g}" for name, value in setting.items()) for setting in settings]
+        there = [name for name in (*_FILES, SWEEP, SWEEP_CURVES) if (path / name).exists()]
+        if there and not (overwrite and SWEEP in there):
+            raise UserError(f"{path} already holds {', '.join(there)}: choose another --out, or replace a sweep with --overwrite")
+        folders = [",".join(f"{name}={value!r}" for name, value in setting.items()) for setting in settings]
         specs = [dataclasses.replace(spec, config=with_values(spec.config, setting)) for setting in settings]
         self.runs = [RunWriter(path / folder, spec, overwrite=overwrite) for folder, spec in zip(folders, specs, strict=True)]
 
-    def finish(self, result: Result) -> list[dict[str, str]]:
-        """Finishes the run of each setting, then writes the table and the picture; returns the rows of the table."""
+    def finish(self, result: Result) -> list[dict[str, Any]]:
+        """Finishes the run of each setting, then writes the table and the picture; returns the rows of the table.
+
+        The median is over the seeds that reached 95%, None if none did; in environment steps, for bc in updates.
+        """
         num_seeds = len(result.seeds) // len(self.runs)
         parts = [result.part(slice(index * num_seeds, (index + 1) * num_seeds)) for index in range(len(self.runs))]
+        unit = "updates" if result.config.algo == "bc" else "env_steps"
         table = []
         for setting, writer, part in zip(self.settings, self.runs, parts, strict=True):
             seeds = writer.finish(part, film=False)["seeds"]
-            final, steps = (
-                [seed["final_success"] for seed in seeds],
-                [seed["env_steps_to_95"] for seed in seeds if seed["env_steps_to_95"] is not None],
-            )
+            final = [seed["final_success"] for seed in seeds]
+            steps = [seed[f"{unit}_to_95"] for seed in seeds if seed[f"{unit}_to_95"] is not None]
             outcome = {
-                "95% reached": f"{len(steps)} of {num_seeds}",
-                "median steps": f"{np.median(steps):,.0f}" if steps else "never",
-                "mean final": f"{np.mean(final):.0%}",
-                "worst": f"{min(final):.0%}",
+                "seeds": num_seeds,
+                "seeds_reaching_95": len(steps),
+                f"median_{unit.removeprefix('env_')}_to_95": float(np.median(steps)) if steps else None,
+                "mean_final_success": float(np.mean(final)),
+                "worst_final_success": min(final),
             }
-            table.append({name: f"{value:g}" for name, value in setting.items()} | outcome)
+            table.append(setting | outcome)
         with _disk_trouble(self.path):
             with (self.path / SWEEP).open("w", newline="") as file:
                 writer = csv.DictWriter(file, list(table[0]))
@@ -240,15 +247,17 @@ def save_run(path: str | os.PathLike[str], result: Result, *, demos: str = FROM_
       overwrite: replace a run that is there.
 
     Raises:
-      UserError: if the directory already holds a run and `overwrite` is off, or cannot be written.
+      UserError: if the directory already holds a run and `overwrite` is off, or cannot be written, or the result has several configs.
     """
+    if len(set(result.configs)) > 1:
+        raise UserError("the runs of this result have different configs: save each config's own, for example result.part(slice(0, 8))")
     writer = RunWriter(Path(path), RunSpec(env=result.env, config=result.config, demos=demos, seeds=result.seeds), overwrite=overwrite)
     writer.start()
     return writer.finish(result)
 
 
 def summarise(result: Result) -> dict[str, Any]:
-    """The contents of `summary.json`."""
+    """The contents of `summary.json`. Rates are those of the result's own seeds; other settings of a sweep ran beside them in the same time."""
     seconds, num_seeds = result.train_seconds, len(result.seeds)
     return {
         "seeds": [dataclasses.asdict(seed) for seed in result.summaries()],

@@ -101,7 +101,10 @@ def test_sweep_leaves_a_run_for_each_setting(tmp_path, capsys):
     folders = ["learning_rate=0.001,bc_weight=0.1", "learning_rate=0.002,bc_weight=0.1"]
     assert sorted(file.name for file in out.iterdir()) == [*folders, "sweep.csv", "sweep.png"]
     rows = list(csv.DictReader((out / "sweep.csv").read_text().splitlines()))
-    assert [(row["learning_rate"], row["bc_weight"], row["95% reached"]) for row in rows] == [("0.001", "0.1", "0 of 2"), ("0.002", "0.1", "0 of 2")]
+    assert [[row[name] for name in ("learning_rate", "bc_weight", "seeds", "seeds_reaching_95", "median_steps_to_95")] for row in rows] == [
+        ["0.001", "0.1", "2", "0", ""],
+        ["0.002", "0.1", "2", "0", ""],
+    ]
     for folder, rate in zip(folders, (1e-3, 2e-3), strict=True):
         run = load_run(out / folder)
         assert (run.spec.seeds, run.spec.config.agent.learning_rate, run.spec.config.agent.bc_weight) == ((5, 6), rate, 0.1)
@@ -110,7 +113,8 @@ def test_sweep_leaves_a_run_for_each_setting(tmp_path, capsys):
         assert [(row["seed"], row["env_steps"]) for row in metrics] == [("5", "240"), ("6", "240"), ("5", "260"), ("6", "260")]
     first, second = (np.load(out / folder / "parameters.npz")["policy/params/Dense_0/kernel"] for folder in folders)
     assert np.abs(first - second).max() > 0.0
-    assert "already holds a run" in refusal(capsys, "sweep", "--over", "learning_rate=1e-3,2e-3", "--over", "bc_weight=0.1", "--out", out, *TINY)
+    assert "already holds sweep.csv" in refusal(capsys, "sweep", "--over", "gamma=0.9,0.8", "--out", out, *TINY)
+    assert "already holds config.json" in refusal(capsys, "sweep", "--over", "gamma=0.9,0.8", "--overwrite", "--out", out / folders[0], *TINY)
 
 
 @pytest.mark.parametrize(
@@ -122,17 +126,30 @@ def test_sweep_leaves_a_run_for_each_setting(tmp_path, capsys):
         (["sweep", "--over", "gamma"], "write for example --over gamma=0.1,0.2"),
         (["sweep", "--over", "gamma=0.9,x"], "write for example --over gamma=0.1,0.2"),
         (["sweep", "--over", "gamma=0.9,0.9"], "a value is listed twice"),
+        (["sweep", "--over", "gamma=0.9,0.9000000001"], "a value is listed twice"),
+        (["sweep", "--over", "k=1,2"], "would change nothing: epsilon depends on it only for m > 0"),
+        (["sweep", "--over", "union_sampling_ratio=0.1,0.2"], "would change nothing: only relabelling by joint_union"),
+        (["sweep", "--algo", "bc", "--over", "gamma=0.1,0.2"], "would change nothing: behaviour cloning does not use it"),
         (["sweep", "--over", "gamma=0.9", "--over", "gamma=0.8"], "gamma is given twice"),
         (["sweep", "--over", "gamma=0.9,1.5"], "gamma = 1.5 is not usable"),
         (["train", "--host", "0"], "add --distributed"),
         (["train", "--distributed", "--host", "0"], "belong together"),
-        (["train", "--distributed"], "cannot join the other hosts"),
+        (["train", "--distributed", "--coordinator", "first", "--num-hosts", "2", "--host", "0"], "write HOST:PORT"),
+        (["train", "--distributed", "--coordinator", "first:1", "--num-hosts", "2", "--host", "2"], "--host 2 is not one of --num-hosts 2"),
     ],
 )
 def test_sweeps_and_hosts_that_make_no_sense_are_refused(arguments, message, tmp_path, capsys):
     out = tmp_path / "run"
-    assert message in refusal(capsys, *arguments, "--out", out, *TINY)
+    tiny = [] if "bc" in arguments else TINY
+    assert message in refusal(capsys, *arguments, "--out", out, *tiny)
     assert not out.exists()
+
+
+def test_a_place_inside_a_file_is_refused(tmp_path, capsys):
+    file = tmp_path / "file"
+    file.write_text("mine")
+    assert "is a file" in refusal(capsys, "train", "--out", file / "run", *TINY)
+    assert file.read_text() == "mine"
 
 
 def test_eval_and_render_read_the_run_back(run, tmp_path, capsys):

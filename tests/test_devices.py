@@ -6,6 +6,7 @@ import os
 import socket
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -40,18 +41,19 @@ def with_devices(count):
     return os.environ | quick | {"JAX_NUM_CPU_DEVICES": str(count), "JAX_PLATFORMS": "cpu"}
 
 
-def test_eight_devices_give_what_one_gives():
+def test_two_and_eight_devices_give_what_one_gives():
     outputs = []
-    for count in (1, 8):
+    for count in (1, 2, 8):
         done = subprocess.run([sys.executable, "-c", TRAIN], env=with_devices(count), capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         outputs.append(json.loads(done.stdout))
-    one, eight = outputs
-    assert (one["devices"], eight["devices"]) == ([1], [8])  # every leaf of the state lies on all of them
-    for expected, given in zip(one["metrics"], eight["metrics"], strict=True):
-        for name, value in expected.items():
-            assert given[name] == pytest.approx(value, rel=1e-3, abs=1e-5), name
-    np.testing.assert_allclose(eight["checksum"], one["checksum"], rtol=1e-3)
+    one, *others = outputs
+    assert [output["devices"] for output in outputs] == [[1], [2], [8]]  # every leaf of the state lies on all of them
+    for several in others:
+        for expected, given in zip(one["metrics"], several["metrics"], strict=True):
+            for name, value in expected.items():
+                assert given[name] == pytest.approx(value, rel=1e-3, abs=1e-5), name
+        np.testing.assert_allclose(several["checksum"], one["checksum"], rtol=1e-3)
 
 
 def hindrl(*arguments, devices=1):
@@ -68,13 +70,17 @@ def test_two_processes_give_what_one_gives(tmp_path):
         port = probe.getsockname()[1]
     together = ["--distributed", "--coordinator", f"127.0.0.1:{port}", "--num-hosts", 2]
     runs = [
-        hindrl("train", "--out", tmp_path / "two", *tiny.split(), "--buffer-size", 2000, *together, "--host", 0),
-        hindrl("train", "--out", tmp_path / "two", *tiny.split(), "--buffer-size", 2000, *together, "--host", 1),
-        hindrl("train", "--out", tmp_path / "one", *tiny.split(), "--buffer-size", 2000),
+        hindrl("train", "--out", tmp_path / "two", *tiny.split(), *together, "--host", 0),
+        hindrl("train", "--out", tmp_path / "two", *tiny.split(), *together, "--host", 1),
+        hindrl("train", "--out", tmp_path / "one", *tiny.split()),
     ]
-    outputs = [run.communicate(timeout=300) for run in runs]
+    try:
+        outputs = [run.communicate(timeout=300) for run in runs]
+    finally:
+        for run in runs:
+            run.kill()
     assert [run.returncode for run in runs] == [0, 0, 0], outputs
-    assert "for 2 devices" in outputs[0][0]
+    assert "on 2 of 2 devices" in outputs[0][0]
     assert "FixedGrid" in outputs[0][0]
     assert "FixedGrid" not in outputs[1][0]  # only the first host prints and writes
     one, two = (list(csv.DictReader((tmp_path / name / "metrics.csv").read_text().splitlines())) for name in ("one", "two"))
@@ -87,15 +93,19 @@ def test_two_processes_give_what_one_gives(tmp_path):
             np.testing.assert_allclose(second[name], first[name], rtol=1e-3, atol=1e-4, err_msg=name)
 
 
-@pytest.mark.parametrize(("num_seeds", "num_devices", "used"), [(1, 8, 1), (8, 8, 8), (6, 4, 3), (7, 4, 1), (5, 8, 5)])
-def test_as_many_devices_as_divide_the_seeds(num_seeds, num_devices, used, monkeypatch):
-    monkeypatch.setattr(devices.jax, "devices", lambda: list(range(num_devices)))
-    monkeypatch.setattr(devices, "Mesh", lambda chosen, axes: (len(chosen), axes))
-    assert devices.seed_mesh(num_seeds) == (used, ("seed",))
+@pytest.mark.parametrize(
+    ("num_seeds", "hosts", "devices_each", "used"), [(1, 1, 8, 1), (8, 1, 8, 8), (6, 1, 4, 3), (7, 1, 4, 1), (5, 1, 8, 5), (64, 2, 48, 64)]
+)
+def test_as_many_devices_as_divide_the_seeds(num_seeds, hosts, devices_each, used, monkeypatch):
+    made = [SimpleNamespace(process_index=host) for host in range(hosts) for _ in range(devices_each)]
+    monkeypatch.setattr(devices.jax, "devices", lambda: made)
+    monkeypatch.setattr(devices.jax, "process_count", lambda: hosts)
+    monkeypatch.setattr(devices, "Mesh", lambda chosen, axes: chosen)
+    chosen = devices.seed_mesh(num_seeds)
+    assert [sum(device.process_index == host for device in chosen) for host in range(hosts)] == [used // hosts] * hosts
 
 
-def test_several_hosts_use_all_their_devices(monkeypatch):
-    monkeypatch.setattr(devices.jax, "devices", lambda: list(range(4)))
+def test_hosts_share_evenly(monkeypatch):
     monkeypatch.setattr(devices.jax, "process_count", lambda: 2)
-    with pytest.raises(devices.UserError, match="6 runs cannot be shared evenly between 4 devices"):
-        devices.seed_mesh(6)
+    with pytest.raises(devices.UserError, match="make --seeds a multiple of 2"):
+        devices.seed_mesh(7)

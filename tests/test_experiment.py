@@ -1,6 +1,7 @@
 """Running experiments: thresholds of the summary, exact length of a run, and seeds that do not depend on each other."""
 
 import dataclasses
+from pathlib import Path
 from types import SimpleNamespace
 
 import chex
@@ -103,6 +104,9 @@ def test_configs_that_differ_in_numbers_share_one_program(demonstrations):
             np.testing.assert_allclose(part.rows[0].metrics[name], value, rtol=1e-3, atol=1e-5, err_msg=name)
         chex.assert_trees_all_close(part.state.agent, single.state.agent, rtol=1e-3, atol=1e-4)
         chex.assert_trees_all_close(part.guidance.epsilon, single.guidance.epsilon, rtol=1e-5)
+    with pytest.raises(hindrl.UserError, match="different configs"):
+        hindrl.save_run("nowhere", together)
+    assert not Path("nowhere").exists()
     metrics = [single.rows[0].metrics for single in alone]
     assert all(metrics[0][name] != metrics[1][name] for name in metrics[0] if name != "batch/reward")
 

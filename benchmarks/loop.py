@@ -1,0 +1,93 @@
+"""The project's own training loop, brought to where it learns: what most of the benchmark times."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+import hindrl_jax
+from hindrl_jax import replay
+from hindrl_jax import train as training
+from hindrl_jax.config import BatchConfig, TrainConfig
+from hindrl_jax.train import Guidance, TrainState
+from hindrl_jax.types import Array, Environment, Transition
+
+_RUN_ONCE = {"xla_backend_optimization_level": 0}  # for a program whose compilation takes longer than its one run
+
+
+class Loop:
+    """Training on FixedGridPickAndPlace with one demonstration."""
+
+    def __init__(self, config: TrainConfig, *, num_seeds: int | None = None, full: bool = False):
+        """Steps the environments at random: as long as `hindrl_jax.fit` does before it learns, or until the replay is full.
+
+        Args:
+          config: of the run.
+          num_seeds: maps everything over that many seeds, as `fit` does even for one; None maps nothing.
+          full: fill the replay.
+        """
+        self.config = config
+        self.num_seeds = num_seeds
+        self.env = hindrl_jax.make("FixedGridPickAndPlace")
+        demonstrations = hindrl_jax.record_demonstrations(self.env, 1).episodes
+        key = jax.random.key(0)
+        if num_seeds is not None:
+            demonstrations = jax.tree.map(lambda leaf: jnp.stack([leaf] * num_seeds), demonstrations)
+            key = jax.random.split(key, num_seeds)
+        self.data: Guidance = jax.jit(self._program(training.guidance))(demonstrations)
+        self.state: TrainState = jax.jit(self._program(training.init)).lower(key, self.data).compile(_RUN_ONCE)(key, self.data)
+        num_iterations = self.capacity // config.num_envs if full else training.warm_up_iterations(self.env, config)
+        collect = jax.jit(self._program(training.collect, num_iterations=num_iterations), donate_argnums=0)
+        self.state = jax.block_until_ready(collect(self.state, self.data))
+
+    @property
+    def capacity(self) -> int:
+        """Transitions that the replay of one seed has room for."""
+        return self.state.replay.episodes.rewards.size // (self.num_seeds or 1)
+
+    def learner(self, num_updates: int) -> Callable[[], None]:
+        """Compiles `train.learn` for `num_updates` gradient steps, whole iterations of the loop; each call of the result goes on from the last."""
+        num_iterations, rest = divmod(num_updates, self.config.updates_per_iteration)
+        if rest:
+            raise ValueError(f"{num_updates} gradient steps are no multiple of the {self.config.updates_per_iteration} of an iteration")
+        learn = jax.jit(self._program(training.learn, num_iterations=num_iterations), donate_argnums=0).lower(self.state, self.data).compile()
+
+        def call() -> None:
+            self.state, metrics = learn(self.state, self.data)
+            jax.block_until_ready((self.state, metrics))
+
+        return call
+
+    def _program(self, function: Callable[..., Any], **static: Any) -> Callable[..., Any]:
+        program = functools.partial(function, env=self.env, config=self.config, **static)
+        return program if self.num_seeds is None else jax.vmap(program)
+
+
+def draw_batch(key: Array, state: TrainState, data: Guidance, *, env: Environment, config: BatchConfig) -> Transition:
+    """The batch of one gradient step, drawn as `train.learn` draws it."""
+    return replay.sample_batch(
+        key,
+        state.replay,
+        data.demonstrations,
+        data.goals,
+        achieved_goal=env.achieved_goal,
+        epsilon=data.epsilon,
+        demo_rows=replay.num_demo_rows(state.env_steps, config),
+        config=config,
+    )
+
+
+def sampler(loop: Loop, config: BatchConfig, num_batches: int) -> Callable[[], Transition]:
+    """Compiles the drawing of `num_batches` batches, one after the other, from the replay that the loop (of no mapped seeds) has at each call."""
+
+    @jax.jit
+    def draw(key: Array, state: TrainState, data: Guidance) -> Transition:
+        keys = jax.random.split(key, num_batches)
+        return jax.lax.map(lambda key: draw_batch(key, state, data, env=loop.env, config=config), keys)
+
+    key = jax.random.key(0)
+    return lambda: jax.block_until_ready(draw(key, loop.state, loop.data))

@@ -1,0 +1,69 @@
+"""What the relabelling strategies add to drawing a batch, and what the epsilon filter costs once per run."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+
+import hindrl_jax
+from benchmarks import report, timing
+from benchmarks.loop import Loop, sampler
+from benchmarks.timing import Contestant, Options, Row
+from hindrl_jax import goals
+from hindrl_jax.config import BatchConfig
+
+TITLE = "Relabelling"
+STRATEGIES = ("final", "future", "episode", "task_conditioned", "joint_union")
+BATCH_SIZE = 4096
+BATCHES_PER_CALL = 10
+NUM_DEMONSTRATIONS = (1, 10, 100)
+
+
+def run(options: Options) -> list[Row]:
+    """One row per strategy, milliseconds per batch, and one per number of demonstrations, milliseconds for filtering all of them."""
+    config = hindrl_jax.preset("hindrl")
+    loop = Loop(dataclasses.replace(config, buffer_size=12_800) if options.quick else config, full=True)
+    print(f"{TITLE}: replay.sample_batch, batch {BATCH_SIZE}, from a full replay of {loop.capacity:,} transitions", flush=True)
+    batches = {"off": dataclasses.replace(config.batch, batch_size=BATCH_SIZE, num_sampled_goals=0.0)} | {
+        strategy: dataclasses.replace(config.batch, batch_size=BATCH_SIZE, hindrl_sampling_strategy=strategy)
+        for strategy in (STRATEGIES[-1:] if options.quick else STRATEGIES)
+    }
+    contestants = {strategy: _draws(loop, batch) for strategy, batch in batches.items()}
+    rows = [{"what": "sample_batch", "strategy": strategy} | result for strategy, result in timing.take_turns(contestants, options.effort).items()]
+
+    env = loop.env
+    demonstrations = hindrl_jax.record_demonstrations(env, max(NUM_DEMONSTRATIONS)).episodes
+    achieved = env.achieved_goal(demonstrations.observations)
+    epsilon = goals.epsilon_from_demonstrations(achieved, demonstrations.lengths, m=5, k=0.0)
+    contestants = {number: _filter(achieved[:number], epsilon) for number in NUM_DEMONSTRATIONS}
+    rows += [
+        {"what": "epsilon_filter", "demonstrations": number} | result for number, result in timing.take_turns(contestants, options.effort).items()
+    ]
+    for row in rows:
+        print(timing.line(_name(row), row), flush=True)
+    return rows
+
+
+def _draws(loop: Loop, batch: BatchConfig) -> Contestant:
+    return timing.calls(sampler(loop, batch, BATCHES_PER_CALL), units=BATCHES_PER_CALL)
+
+
+def _filter(achieved_goals: jax.Array, epsilon: jax.Array) -> Contestant:
+    program = jax.jit(jax.vmap(goals.epsilon_filter, (0, None)))
+    return timing.calls(lambda: jax.block_until_ready(program(achieved_goals, epsilon)))
+
+
+def _name(row: Row) -> str:
+    return f"batch, {row['strategy']}" if row["what"] == "sample_batch" else f"epsilon filter, demonstrations: {row['demonstrations']}"
+
+
+def tables(rows: list[Row]) -> str:
+    """One table for both."""
+    text = (
+        f"Drawing one batch of {BATCH_SIZE} from a full replay, demonstration rows included, by strategy; and the epsilon filter over all "
+        "demonstrations (101 states each, once per run, the call from Python included). The relabelled share of a batch does not change its "
+        "cost: goals are drawn for all rows.\n\n"
+    )
+    lines = [[_name(row), timing.milliseconds(row, "cpu"), timing.milliseconds(row, "wall")] for row in rows]
+    return text + report.table(["what", "CPU ms", "wall ms"], lines)

@@ -1,0 +1,110 @@
+"""Gradient steps of hindrl_jax, for `gradient_step` to time: a worker that speaks like those in `peers`.
+
+    python -m benchmarks.worker_ours --who ours --setting grid
+
+It prints `ready` when it has compiled; each line that it then reads is a number of gradient steps (a multiple of the setting's `steps_per_call`),
+and it answers with one line of JSON, {"steps": 20, "cpu_ms": 54.1, "wall_ms": 28.2}, milliseconds per gradient step. It ends where its input ends.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+from benchmarks import passes, timing
+from benchmarks.loop import Loop, draw_batch
+from benchmarks.settings import SETTINGS, Setting
+from hindrl_jax import agent as agents
+from hindrl_jax.agent import AgentState
+from hindrl_jax.train import Guidance, TrainState
+from hindrl_jax.types import Array, Transition
+
+
+def whole_loop(setting: Setting) -> Callable[[], None]:
+    """`train.learn`: environment steps, insertion into the replay, sampling and relabelling included."""
+    return Loop(setting.config).learner(setting.steps_per_call)
+
+
+def whole_loop_mapped(setting: Setting) -> Callable[[], None]:
+    """The same, mapped over seeds, of which there is one."""
+    return Loop(setting.config, num_seeds=1).learner(setting.steps_per_call)
+
+
+def whole_loop_bfloat16(setting: Setting) -> Callable[[], None]:
+    """The same with the networks' products in bfloat16."""
+    agent = dataclasses.replace(setting.config.agent, network_precision="bfloat16")
+    return whole_loop(dataclasses.replace(setting, config=dataclasses.replace(setting.config, agent=agent)))
+
+
+def update_alone(setting: Setting) -> Callable[[], None]:
+    """`agent.update` on one batch that stays the same."""
+    config, loop = setting.config.agent, Loop(setting.config)
+    env = loop.env
+    schedule = agents.schedule(0.0, config, action_dim=env.action_dim)
+
+    @jax.jit
+    def prepare(state: TrainState, data: Guidance) -> tuple[Transition, Array, Array]:
+        batch = draw_batch(jax.random.key(0), state, data, env=env, config=setting.config.batch)
+
+        def inputs(observation: Array) -> Array:
+            return agents.network_inputs(observation, env.achieved_goal(observation), batch.desired_goal, data.scale, config)
+
+        return batch, inputs(batch.observation), inputs(batch.next_observation)
+
+    def updates(agent: AgentState, key: Array, batch: Transition, inputs: Array, next_inputs: Array) -> AgentState:
+        def one(agent: AgentState, key: Array) -> tuple[AgentState, Any]:
+            return agents.update(key, agent, batch, inputs=inputs, next_inputs=next_inputs, schedule=schedule, config=config)
+
+        return jax.lax.scan(one, agent, jax.random.split(key, setting.steps_per_call))
+
+    agent, key, fixed = loop.state.agent, jax.random.key(1), prepare(loop.state, loop.data)
+    compiled = jax.jit(updates, donate_argnums=0).lower(agent, key, *fixed).compile()
+
+    def call() -> None:
+        nonlocal agent
+        agent, metrics = compiled(agent, key, *fixed)
+        jax.block_until_ready((agent, metrics))
+
+    return call
+
+
+def network_passes(setting: Setting, *, own: bool) -> Callable[[], None]:
+    """See `passes`."""
+    dims, config, batch_size = setting.dims(), setting.config.agent, setting.config.batch.batch_size
+    form = passes.own(config, dims["action_dim"], batch_size) if own else passes.plain(dims["action_dim"])
+    return passes.stepper(form, config, **dims, batch_size=batch_size, num_steps=setting.steps_per_call)
+
+
+CONTESTANTS: dict[str, Callable[[Setting], Callable[[], None]]] = {
+    "ours": whole_loop,
+    "ours-mapped": whole_loop_mapped,
+    "ours-bfloat16": whole_loop_bfloat16,
+    "ours-update": update_alone,
+    "passes": lambda setting: network_passes(setting, own=False),
+    "passes-own": lambda setting: network_passes(setting, own=True),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--who", choices=CONTESTANTS, required=True)
+    parser.add_argument("--setting", choices=SETTINGS, required=True)
+    arguments = parser.parse_args()
+    setting = SETTINGS[arguments.setting]
+    contestant = timing.calls(CONTESTANTS[arguments.who](setting), units=setting.steps_per_call)
+    contestant.turn(1)
+    print("ready", flush=True)
+    for request in sys.stdin:
+        steps = int(request)
+        cost = contestant.turn(steps // contestant.units)
+        print(json.dumps({"steps": steps, "cpu_ms": 1000.0 * cost.cpu / steps, "wall_ms": 1000.0 * cost.wall / steps}), flush=True)
+
+
+if __name__ == "__main__":
+    main()
