@@ -20,13 +20,13 @@ FOLDER = Path(__file__).parent
 
 OURS = {
     "ours": "`train.learn`: the whole loop, environment steps, replay and sampling included",
-    "ours-mapped": "the same mapped over seeds by `jax.vmap`, of which there is one; `hindrl_jax.fit` maps over its seeds",
     "ours-bfloat16": "`ours` with `network_precision = bfloat16`",
     "ours-update": "`agent.update` alone, on one fixed batch",
     "passes-own": "nothing but the network passes, by the project's networks",
     "passes": "nothing but the network passes, written the usual way and left to XLA",
 }
 QUICK = ("ours", "ours-update", "passes-own")
+_SBX = {"JAX_PLATFORMS": "cpu", "JAX_NUM_CPU_DEVICES": "1"}  # as JAX comes
 # Name -> worker, its steps per call, variables of its environment, description.
 PEERS = {
     "sb3-contrib": ("worker_sb3.py", 1, {}, "`TQC.train`, as it comes"),
@@ -36,8 +36,8 @@ PEERS = {
         {"MALLOC_MMAP_THRESHOLD_": "2000000000", "MALLOC_TRIM_THRESHOLD_": "4000000000"},
         "the same, and glibc told to keep large blocks of memory",
     ),
-    "sbx": ("worker_sbx.py", 1, {"JAX_PLATFORMS": "cpu"}, "`TQC.train` with 1 gradient step per call, the default of `learn`"),
-    "sbx-20": ("worker_sbx.py", 20, {"JAX_PLATFORMS": "cpu"}, "the same with 20 gradient steps per call"),
+    "sbx": ("worker_sbx.py", 1, _SBX, "`TQC.train` with 1 gradient step per call, the default of `learn`"),
+    "sbx-20": ("worker_sbx.py", 20, _SBX, "the same with 20 gradient steps per call"),
 }
 
 

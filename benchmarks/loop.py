@@ -7,12 +7,14 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
 
 import hindrl_jax
 from hindrl_jax import replay
 from hindrl_jax import train as training
 from hindrl_jax.config import BatchConfig, TrainConfig
+from hindrl_jax.devices import over_seeds, spread
 from hindrl_jax.train import Guidance, TrainState
 from hindrl_jax.types import Array, Environment, Transition
 
@@ -22,22 +24,22 @@ _RUN_ONCE = {"xla_backend_optimization_level": 0}  # for a program whose compila
 class Loop:
     """Training on FixedGridPickAndPlace with one demonstration."""
 
-    def __init__(self, config: TrainConfig, *, num_seeds: int | None = None, full: bool = False):
+    def __init__(self, config: TrainConfig, *, num_seeds: int = 1, num_devices: int = 1, full: bool = False):
         """Steps the environments at random: as long as `hindrl_jax.fit` does before it learns, or until the replay is full.
 
         Args:
           config: of the run.
-          num_seeds: maps everything over that many seeds, as `fit` does even for one; None maps nothing.
+          num_seeds, num_devices: seeds side by side and how many devices share them, as in `fit`.
           full: fill the replay.
         """
         self.config = config
         self.num_seeds = num_seeds
+        self._mesh = Mesh(np.asarray(jax.devices()[:num_devices]), ("seed",))
         self.env = hindrl_jax.make("FixedGridPickAndPlace")
         demonstrations = hindrl_jax.record_demonstrations(self.env, 1).episodes
-        key = jax.random.key(0)
-        if num_seeds is not None:
-            demonstrations = jax.tree.map(lambda leaf: jnp.stack([leaf] * num_seeds), demonstrations)
-            key = jax.random.split(key, num_seeds)
+        demonstrations = jax.tree.map(lambda leaf: np.stack([leaf] * num_seeds), jax.device_get(demonstrations))
+        demonstrations, seeds = spread((demonstrations, np.arange(num_seeds, dtype=np.uint32)), self._mesh)
+        key = jax.jit(over_seeds(jax.random.key, self._mesh))(seeds)
         self.data: Guidance = jax.jit(self._program(training.guidance))(demonstrations)
         self.state: TrainState = jax.jit(self._program(training.init)).lower(key, self.data).compile(_RUN_ONCE)(key, self.data)
         num_iterations = self.capacity // config.num_envs if full else training.warm_up_iterations(self.env, config)
@@ -47,7 +49,7 @@ class Loop:
     @property
     def capacity(self) -> int:
         """Transitions that the replay of one seed has room for."""
-        return self.state.replay.episodes.rewards.size // (self.num_seeds or 1)
+        return self.state.replay.episodes.rewards.size // self.num_seeds
 
     def learner(self, num_updates: int) -> Callable[[], None]:
         """Compiles `train.learn` for `num_updates` gradient steps, whole iterations of the loop; each call of the result goes on from the last."""
@@ -63,8 +65,12 @@ class Loop:
         return call
 
     def _program(self, function: Callable[..., Any], **static: Any) -> Callable[..., Any]:
-        program = functools.partial(function, env=self.env, config=self.config, **static)
-        return program if self.num_seeds is None else jax.vmap(program)
+        return over_seeds(functools.partial(function, env=self.env, config=self.config, **static), self._mesh)
+
+
+def first_seed(tree: Any) -> Any:
+    """Leaves (S, ...) -> those of the first seed; inside a program this costs nothing."""
+    return jax.tree.map(lambda leaf: leaf[0], tree)
 
 
 def draw_batch(key: Array, state: TrainState, data: Guidance, *, env: Environment, config: BatchConfig) -> Transition:
@@ -82,10 +88,11 @@ def draw_batch(key: Array, state: TrainState, data: Guidance, *, env: Environmen
 
 
 def sampler(loop: Loop, config: BatchConfig, num_batches: int) -> Callable[[], Transition]:
-    """Compiles the drawing of `num_batches` batches, one after the other, from the replay that the loop (of no mapped seeds) has at each call."""
+    """Compiles the drawing of `num_batches` batches, one after the other, from the replay that the loop (of one seed) has at each call."""
 
     @jax.jit
     def draw(key: Array, state: TrainState, data: Guidance) -> Transition:
+        state, data = first_seed((state, data))
         keys = jax.random.split(key, num_batches)
         return jax.lax.map(lambda key: draw_batch(key, state, data, env=loop.env, config=config), keys)
 

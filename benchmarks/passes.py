@@ -74,7 +74,7 @@ def own(config: AgentConfig, action_dim: int, batch_size: int) -> Form:
     num_blocks = agents._num_blocks(batch_size, config)
 
     def mean_gradient(gradient: Callable[[Batch], Params], batch: Batch) -> Params:
-        return agents._mean_over_blocks(jax.random.key(0), lambda key, block: gradient(block), batch, num_blocks)
+        return agents._mean_over_blocks(gradient, batch, num_blocks)
 
     return Form(
         action=lambda actor, inputs: networks.apply_actor(actor, inputs, config, action_dim=action_dim).mode,

@@ -34,6 +34,7 @@ def prepare_process(*, cores: int, quick: bool) -> None:
     """Settings that must stand before JAX starts, and that the processes started from here inherit."""
     if hasattr(os, "sched_setaffinity"):  # Linux; XLA and PyTorch take as many threads as they see cores
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
+    os.environ["JAX_NUM_CPU_DEVICES"] = str(cores)  # as the `hindrl` command does
     os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"  # several processes share a GPU
     if quick:
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK_FLAGS}".strip()

@@ -18,7 +18,7 @@ from typing import Any
 import jax
 
 from benchmarks import passes, timing
-from benchmarks.loop import Loop, draw_batch
+from benchmarks.loop import Loop, draw_batch, first_seed
 from benchmarks.settings import SETTINGS, Setting
 from hindrl_jax import agent as agents
 from hindrl_jax.agent import AgentState
@@ -29,11 +29,6 @@ from hindrl_jax.types import Array, Transition
 def whole_loop(setting: Setting) -> Callable[[], None]:
     """`train.learn`: environment steps, insertion into the replay, sampling and relabelling included."""
     return Loop(setting.config).learner(setting.steps_per_call)
-
-
-def whole_loop_mapped(setting: Setting) -> Callable[[], None]:
-    """The same, mapped over seeds, of which there is one."""
-    return Loop(setting.config, num_seeds=1).learner(setting.steps_per_call)
 
 
 def whole_loop_bfloat16(setting: Setting) -> Callable[[], None]:
@@ -50,6 +45,7 @@ def update_alone(setting: Setting) -> Callable[[], None]:
 
     @jax.jit
     def prepare(state: TrainState, data: Guidance) -> tuple[Transition, Array, Array]:
+        state, data = first_seed((state, data))
         batch = draw_batch(jax.random.key(0), state, data, env=env, config=setting.config.batch)
 
         def inputs(observation: Array) -> Array:
@@ -63,7 +59,7 @@ def update_alone(setting: Setting) -> Callable[[], None]:
 
         return jax.lax.scan(one, agent, jax.random.split(key, setting.steps_per_call))
 
-    agent, key, fixed = loop.state.agent, jax.random.key(1), prepare(loop.state, loop.data)
+    agent, key, fixed = first_seed(loop.state.agent), jax.random.key(1), prepare(loop.state, loop.data)
     compiled = jax.jit(updates, donate_argnums=0).lower(agent, key, *fixed).compile()
 
     def call() -> None:
@@ -83,7 +79,6 @@ def network_passes(setting: Setting, *, own: bool) -> Callable[[], None]:
 
 CONTESTANTS: dict[str, Callable[[Setting], Callable[[], None]]] = {
     "ours": whole_loop,
-    "ours-mapped": whole_loop_mapped,
     "ours-bfloat16": whole_loop_bfloat16,
     "ours-update": update_alone,
     "passes": lambda setting: network_passes(setting, own=False),
