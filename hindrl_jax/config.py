@@ -104,7 +104,7 @@ class AgentConfig:
     layer_norm: bool = False
     """Layer normalisation before each activation of the critics."""
     network_precision: Literal["float32", "bfloat16"] = "float32"
-    """Operands of the networks' products; bfloat16 (summed in float32) is faster on CPUs and GPUs that have it and less exact."""
+    """Operands of the networks' products: float32 (on NVIDIA GPUs TF32, as JAX has it), or bfloat16 summed in float32: faster, less steady."""
     learning_rate: float = 1e-3
     """Adam's step size, for actor, critics and entropy coefficient."""
     final_learning_rate: float | None = None
