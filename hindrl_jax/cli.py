@@ -26,7 +26,7 @@ from rich.table import Table
 
 from experts.recording import RecordableEnvironment
 from hindrl_jax import STARTED, __version__
-from hindrl_jax.config import SWEEPABLE, TrainConfig, with_values, without_effect
+from hindrl_jax.config import SWEEPABLE, TrainConfig, without_effect
 from hindrl_jax.datasets import describe_demonstrations, load_demonstrations, read_states, save_demonstrations
 from hindrl_jax.errors import UserError
 from hindrl_jax.experiment import Result, fit, record_demonstrations
@@ -95,11 +95,10 @@ def _sweep(arguments: list[str]) -> None:
     """Train with several values of hyperparameters, side by side."""
     spec, options = _parse_train(arguments, SweepOptions, "hindrl sweep")
     settings = list(_grid(options.over, spec.config))
-    configs = [checked(lambda values=values: with_values(spec.config, values)) for values in settings]
     out = options.out or _default_out(spec, "sweep")
-    writer = SweepWriter(out, spec, settings, overwrite=options.overwrite)
+    writer = checked(lambda: SweepWriter(out, spec, settings, overwrite=options.overwrite))
     with _hosts(options) as writes:
-        result = _fit(spec, configs, writer.runs if writes else [])
+        result = _fit(spec, [run.spec.config for run in writer.runs], writer.runs if writes else [])
         if writes:
             console.print(_sweep_table(writer.finish(result), list(settings[0])))
             console.print(_speed_line(summarise(result)))
@@ -193,20 +192,19 @@ def _fit(spec: RunSpec, configs: Sequence[TrainConfig], writers: Sequence[RunWri
     progress = Progress(*(TextColumn(c) if isinstance(c, str) else c for c in columns), TimeRemainingColumn(), console=console)
     with progress:
         bar = progress.add_task("compiling", total=spec.config.steps, rates="")
-        reported = {"rows": 0, "updates": 0}
 
         def report(result: Result) -> None:
             if not writers[0].started:
                 for writer in writers:
                     writer.start()
                 progress.console.print(f"compiled in {result.compile_seconds:.1f} s{_on_devices(result)}")
-            if result.updates and not reported["updates"]:
+            elif not progress.tasks[bar].completed:
                 progress.console.print(f"first updates after {time.perf_counter() - STARTED:.1f} s")
+            new_rows = result.rows[len(configs) * writers[0].rows_written :]
             for index, writer in enumerate(writers):
                 writer.report(result.rows_of(slice(index * num_seeds, (index + 1) * num_seeds)))
-            if len(result.rows) > reported["rows"]:
-                progress.console.print(_evaluation_line(result.rows[reported["rows"] :]))
-            reported.update(rows=len(result.rows), updates=result.updates)
+            if new_rows:
+                progress.console.print(_evaluation_line(new_rows))
             success = result.latest_success()
             seconds = max(result.train_seconds, 1e-9)
             rates = f"{num_runs * result.env_steps / seconds:,.0f} steps/s, {num_runs * result.updates / seconds:,.0f} updates/s"

@@ -167,8 +167,8 @@ def fit(
 ) -> Result:
     """Trains one policy per seed, all of them side by side in one compiled program.
 
-    With several devices the seeds are spread over them: of one host over as many as divide their number, of several hosts (after
-    `jax.distributed.initialize`, the same call on each) over all.
+    With several devices the seeds are spread over as many as divide their number; with several hosts (after `jax.distributed.initialize`, the
+    same call on each) they are shared evenly between the hosts first.
 
     Args:
       env: the task.
@@ -234,11 +234,17 @@ def fit(
     return result
 
 
+def _one_for_each(seeds: Sequence[int], given: Any, kind: type[Any], noun: str) -> tuple[Any, ...]:
+    """What was given for all seeds, repeated, or for each of them."""
+    items = (given,) * len(seeds) if isinstance(given, kind) else tuple(given)
+    if len(items) != len(seeds):
+        raise UserError(f"{len(items)} {noun} for {len(seeds)} seeds: give one for all, or one for each")
+    return items
+
+
 def _demonstrations_per_seed(demonstrations: Episodes | Sequence[Episodes], seeds: Sequence[int], env: RecordableEnvironment) -> Episodes:
     """Stacks one table per seed (numpy leaves (S, ...)), having checked that the tables fit the seeds and the environment."""
-    tables = [demonstrations] * len(seeds) if isinstance(demonstrations, Episodes) else list(demonstrations)
-    if len(tables) != len(seeds):
-        raise UserError(f"{len(tables)} tables of demonstrations for {len(seeds)} seeds: give one for all, or one for each")
+    tables = _one_for_each(seeds, demonstrations, Episodes, "tables of demonstrations")
     expected = (env.horizon + 1, env.observation_dim, env.horizon, env.action_dim)
     for table in tables:
         found = table.observations.shape[1:] + table.actions.shape[1:]
@@ -252,9 +258,7 @@ def _demonstrations_per_seed(demonstrations: Episodes | Sequence[Episodes], seed
 
 def _configs_per_seed(config: TrainConfig | Sequence[TrainConfig], seeds: Sequence[int]) -> tuple[TrainConfig, ...]:
     """One config per seed, having checked that one program can serve them all."""
-    configs = (config,) * len(seeds) if isinstance(config, TrainConfig) else tuple(config)
-    if len(configs) != len(seeds):
-        raise UserError(f"{len(configs)} configs for {len(seeds)} seeds: give one for all, or one for each")
+    configs = _one_for_each(seeds, config, TrainConfig, "configs")
     swept = _swept_fields(configs)
     for other in configs[1:]:
         if with_traced_values(configs[0], {name: sweepable_value(other, name) for name in swept}) != other:

@@ -68,30 +68,35 @@ def _quantile_huber_and_gradient(quantiles: Array, targets: Array) -> tuple[Arra
 
 
 def _quantile_huber_of_all_pairs(quantiles: Array, targets: Array) -> tuple[Array, Array]:
-    num_quantiles, num_targets = quantiles.shape[-2], targets.shape[0]
-    midpoints = quantile_midpoints(num_quantiles).reshape((1,) * (quantiles.ndim - 1) + (num_quantiles, 1)).astype(quantiles.dtype)
-    error = targets.reshape((num_targets,) + (1,) * (quantiles.ndim - 1) + (-1,)) - quantiles[None]  # (M, ..., Q, B)
-    clipped = jnp.clip(error, -1.0, 1.0)
-    weighted = jnp.where(error < 0.0, 1.0 - midpoints, midpoints) * clipped
-    scale = 1.0 / (num_quantiles * num_targets)
-    return scale * jnp.sum(weighted * (error - 0.5 * clipped), axis=(0, -2)), -scale * jnp.sum(weighted, axis=0)
+    error = targets.reshape((targets.shape[0],) + (1,) * (quantiles.ndim - 1) + (-1,)) - quantiles[None]  # (M, ..., Q, B)
+    loss, gradient = _pairwise_quantile_huber(error)
+    return _average_over_pairs(jnp.sum(loss, axis=0), jnp.sum(gradient, axis=0), targets.shape[0])
 
 
 def _quantile_huber_in_one_pass(quantiles: Array, targets: Array) -> tuple[Array, Array]:
     """A scan over the target atoms that sums up loss and gradient together."""
-    num_quantiles, num_targets = quantiles.shape[-2], targets.shape[0]
-    midpoints = quantile_midpoints(num_quantiles).reshape((1,) * (quantiles.ndim - 2) + (num_quantiles, 1)).astype(quantiles.dtype)
 
     def add_target(sums: tuple[Array, Array], target: Array) -> tuple[tuple[Array, Array], None]:
-        loss, gradient = sums
-        error = target.reshape((1,) * (quantiles.ndim - 1) + target.shape) - quantiles
-        clipped = jnp.clip(error, -1.0, 1.0)
-        weight = jnp.where(error < 0.0, 1.0 - midpoints, midpoints)
-        return (loss + weight * clipped * (error - 0.5 * clipped), gradient - weight * clipped), None
+        terms = _pairwise_quantile_huber(target.reshape((1,) * (quantiles.ndim - 1) + target.shape) - quantiles)
+        return (sums[0] + terms[0], sums[1] + terms[1]), None
 
     zeros = jnp.zeros_like(quantiles)
     (loss, gradient), _ = jax.lax.scan(add_target, (zeros, zeros), targets)
-    scale = 1.0 / (num_quantiles * num_targets)
+    return _average_over_pairs(loss, gradient, targets.shape[0])
+
+
+def _pairwise_quantile_huber(error: Array) -> tuple[Array, Array]:
+    """Loss of each pair of a quantile and a target, and its derivative by the quantile, for errors target - quantile (..., Q, B)."""
+    num_quantiles = error.shape[-2]
+    midpoints = quantile_midpoints(num_quantiles).reshape((1,) * (error.ndim - 2) + (num_quantiles, 1)).astype(error.dtype)
+    clipped = jnp.clip(error, -1.0, 1.0)
+    weighted = jnp.where(error < 0.0, 1.0 - midpoints, midpoints) * clipped
+    return weighted * (error - 0.5 * clipped), -weighted
+
+
+def _average_over_pairs(loss: Array, gradient: Array, num_targets: int) -> tuple[Array, Array]:
+    """From sums over targets (..., Q, B) to the loss (..., B) and its gradient (..., Q, B)."""
+    scale = 1.0 / (loss.shape[-2] * num_targets)
     return scale * jnp.sum(loss, axis=-2), scale * gradient
 
 

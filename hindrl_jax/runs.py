@@ -199,7 +199,12 @@ class SweepWriter:
     """Writes a sweep: a run's directory for each setting, `sweep.csv` with a row for each, and their curves in `sweep.png`."""
 
     def __init__(self, path: Path, spec: RunSpec, settings: list[dict[str, float]], *, overwrite: bool):
-        """Only checks, as `RunWriter` does; `settings` are the swept fields and their values, in order of the runs."""
+        """Only checks, as `RunWriter` does; `settings` are the swept fields and their values, in order of the runs.
+
+        Raises:
+          ValueError: if a config refuses a value.
+          UserError: if the path holds something else, or a sweep and `overwrite` is off, or cannot be written.
+        """
         self.path, self.settings = path, settings
         there = [name for name in (*_FILES, SWEEP, SWEEP_CURVES) if (path / name).exists()]
         if there and not (overwrite and SWEEP in there):
@@ -214,6 +219,8 @@ class SweepWriter:
         The median is over the seeds that reached 95%, None if none did; in environment steps, for bc in updates.
         """
         num_seeds = len(result.seeds) // len(self.runs)
+        guidance, agent = jax.device_get((result.guidance, result.state.agent))  # once, not for each part
+        result = dataclasses.replace(result, guidance=guidance, state=result.state.replace(agent=agent))
         parts = [result.part(slice(index * num_seeds, (index + 1) * num_seeds)) for index in range(len(self.runs))]
         unit = "updates" if result.config.algo == "bc" else "env_steps"
         table = []
