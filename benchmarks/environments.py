@@ -18,6 +18,7 @@ TITLE = "Environment steps"
 ENVIRONMENTS = ("GridPickAndPlace", "FixedGridPickAndPlace")
 NUM_ENVS = (1, 64, 1024, 4096)
 NUM_ACTIONS = 64  # random actions per environment, drawn beforehand and taken over and over
+STEPS_PER_CALL = 64_000  # or more, of all environments together
 
 
 def run(options: Options) -> list[Row]:
@@ -35,23 +36,23 @@ def run(options: Options) -> list[Row]:
     return rows
 
 
-def stepper(env: Environment, num_envs: int, *, resets: bool) -> Contestant:
+def stepper(env: Environment, num_envs: int, *, resets: bool, num_actions: int = NUM_ACTIONS, steps_per_call: int = STEPS_PER_CALL) -> Contestant:
     """Steps `num_envs` environments in one compiled loop.
 
-    With resets this is `rollout.step`, which starts a new episode where one has ended; without, the bare steps, on beyond the end of episodes.
-    The rewards are summed, so that nothing of a step can be left out.
+    With resets this is `rollout.step`, which goes on from one of the new episodes of `rollout.reset` where one has ended; without, the bare steps,
+    on beyond the end of episodes. The rewards are summed, so that nothing of a step can be left out.
     """
     goals = constant_goal(env.task_goal())
     key_reset, key_actions, key_steps = jax.random.split(jax.random.key(0), 3)
-    actions = jax.random.uniform(key_actions, (NUM_ACTIONS, num_envs, env.action_dim), minval=-1.0, maxval=1.0)
-    keys = jax.random.split(key_steps, NUM_ACTIONS)
-    repeats = max(1, 64_000 // (num_envs * NUM_ACTIONS))
+    actions = jax.random.uniform(key_actions, (num_actions, num_envs, env.action_dim), minval=-1.0, maxval=1.0)
+    keys = jax.random.split(key_steps, num_actions)
+    repeats = max(1, steps_per_call // (num_envs * num_actions))
     start = jax.jit(lambda key: rollout.reset(key, env, goals, num_envs))(key_reset), jnp.zeros(num_envs)
 
     def with_resets(carry: tuple[Any, Array], inputs: tuple[Array, Array]) -> tuple[tuple[Any, Array], None]:
         state, rewards = carry
         key, action = inputs
-        state, time_step = rollout.step(key, state, action, env, goals)
+        state, time_step = rollout.step(state, rollout.reset(key, env, goals, num_envs), action, env)
         return (state, rewards + time_step.reward), None
 
     def without_resets(carry: tuple[Any, Array], inputs: tuple[Array, Array]) -> tuple[tuple[Any, Array], None]:
@@ -65,7 +66,7 @@ def stepper(env: Environment, num_envs: int, *, resets: bool) -> Contestant:
 
         return jax.lax.scan(all_actions, carry, length=repeats)[0]
 
-    return timing.calls(timing.advancing(jax.jit(steps, donate_argnums=0), start, keys, actions), units=num_envs * NUM_ACTIONS * repeats)
+    return timing.calls(timing.advancing(jax.jit(steps, donate_argnums=0), start, keys, actions), units=num_envs * num_actions * repeats)
 
 
 def tables(rows: list[Row]) -> str:

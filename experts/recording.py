@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,32 +12,25 @@ import numpy as np
 from flax import struct
 
 from hindrl_jax.errors import UserError
-from hindrl_jax.types import Array, Environment, Episodes, action_from_env, tree_where
+from hindrl_jax.types import Array, Episodes, RestorableEnvironment, action_from_env, compiler_options, tree_where
 
 Expert = Any
 """A frozen dataclass with a method act(key, env, state) -> (A,) action in the environment's own units."""
 
 
-class RecordableEnvironment(Environment, Protocol):
-    """An environment whose state can be written down as a vector, and read back to be drawn."""
-
-    @property
-    def state_dim(self) -> int: ...
-
-    def state_to_vector(self, state: Any) -> Array: ...
-
-    def vector_to_state(self, key: Array, vector: Array) -> Any: ...
-
-
 @struct.dataclass(kw_only=True)
 class Recording:
-    """Demonstrations, and the environment states that they went through."""
+    """Demonstrations with the environment states that they went through."""
 
-    episodes: Episodes  # N episodes
-    states: Array  # (N, T + 1, S) states as vectors, repeated after the end of an episode
+    episodes: Episodes  # N episodes, states included
+
+    @property
+    def states(self) -> Array:
+        """(N, T + 1, S) states as vectors, repeated after the end of an episode."""
+        return self.episodes.states
 
 
-def play(key: Array, env: RecordableEnvironment, act: Callable[[Array, Any, Array], Array], num_episodes: int) -> Recording:
+def play(key: Array, env: RestorableEnvironment, act: Callable[[Array, Any, Array], Array], num_episodes: int) -> Recording:
     """Plays episodes to their end, solved or not, and notes the states on the way.
 
     The desired goal of an episode is the goal that it reached at its end.
@@ -73,19 +66,41 @@ def play(key: Array, env: RecordableEnvironment, act: Callable[[Array, Any, Arra
                 lengths=jnp.sum(~over),
                 terminated=jnp.any(terminated & ~over),
                 desired_goals=env.achieved_goal(observation),
+                states=jnp.concatenate([states, env.state_to_vector(state)[None]]),
             ),
-            states=jnp.concatenate([states, env.state_to_vector(state)[None]]),
         )
 
     return jax.vmap(episode)(jax.random.split(key, num_episodes))
 
 
-@functools.partial(jax.jit, static_argnames=("env", "expert", "num_episodes"))
-def _play_expert(key: Array, env: RecordableEnvironment, expert: Expert, num_episodes: int) -> Recording:
-    return play(key, env, lambda key, state, observation: expert.act(key, env, state), num_episodes)
+def on_host(env: RestorableEnvironment) -> bool:
+    """Whether the environment is simulated outside JAX, by robosuite: one episode after the other, and never inside a compiled program."""
+    return getattr(env, "backend", None) == "robosuite"
 
 
-def record(key: Array, env: RecordableEnvironment, expert: Expert, num_demos: int, *, max_attempts: int | None = None) -> Recording:
+def player(env: RestorableEnvironment, act: Callable[[Array, Any, Array], Array], num_episodes: int) -> Callable[[Array], Recording]:
+    """`play` as a program, key -> recording, on whatever simulates the environment. It is compiled once.
+
+    Args:
+      env, act, num_episodes: as for `play`.
+
+    Raises:
+      UserError: from the program, if the environment is simulated by robosuite and that is missing or unusable.
+    """
+    if on_host(env):
+        from experts.robosuite_arm import play_in_robosuite
+
+        return lambda key: play_in_robosuite(key, env, act, num_episodes)
+    return jax.jit(lambda key: play(key, env, act, num_episodes), compiler_options=compiler_options(env))
+
+
+@functools.cache
+def _expert_player(env: RestorableEnvironment, expert: Expert, num_episodes: int) -> Callable[[Array], Recording]:
+    """`player` of an expert; cached because a run records for each of its seeds."""
+    return player(env, lambda key, state, observation: expert.act(key, env, state), num_episodes)
+
+
+def record(key: Array, env: RestorableEnvironment, expert: Expert, num_demos: int, *, max_attempts: int | None = None) -> Recording:
     """Records `num_demos` demonstrations that solve the task; unsolved episodes are discarded.
 
     Args:
@@ -95,12 +110,13 @@ def record(key: Array, env: RecordableEnvironment, expert: Expert, num_demos: in
       max_attempts: episodes to play before giving up; by default 100 times `num_demos`.
 
     Raises:
-      UserError: if `num_demos` is below 1, or the expert solves too few episodes.
+      UserError: if `num_demos` is below 1, or the expert solves too few episodes, or the environment's back end is unusable.
     """
     if num_demos < 1:
         raise UserError(f"num_demos = {num_demos} is too few: record at least 1 demonstration")
     max_attempts = 100 * num_demos if max_attempts is None else max_attempts
-    batch_size = max(num_demos, 16)
+    batch_size = 1 if on_host(env) else max(num_demos, 16)
+    play_batch = _expert_player(env, expert, batch_size)
     kept, attempts = [], 0
     while sum(len(batch.states) for batch in kept) < num_demos:
         if attempts >= max_attempts:
@@ -110,7 +126,7 @@ def record(key: Array, env: RecordableEnvironment, expert: Expert, num_demos: in
                 f"but {num_demos} demonstrations are wanted: raise the horizon or ask for fewer"
             )
         key, key_batch = jax.random.split(key)
-        batch = jax.device_get(_play_expert(key_batch, env, expert, batch_size))
+        batch = jax.device_get(play_batch(key_batch))
         kept.append(jax.tree.map(lambda leaf, solved=batch.episodes.terminated: leaf[solved], batch))
         attempts += batch_size
     return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)[:num_demos]), *kept)

@@ -41,35 +41,52 @@ class AgentState:
 _ADAM = optax.scale_by_adam()  # the step size is applied apart, since it may change along a run
 
 
+_LEAST_EXTENT = 1e-6
+
+
 @struct.dataclass(kw_only=True)
 class InputScale:
-    """Typical size of each input dimension, by which the multiscale encoding divides."""
+    """Where each input dimension lies in the demonstrations and how large it is; the encodings other than raw see (x - centre) / scale."""
 
-    observation: Array  # (D,) > 0
-    goal: Array  # (G,) > 0
+    observation: Array  # (D,) scale, > 0
+    goal: Array  # (G,)
+    observation_centre: Array  # (D,)
+    goal_centre: Array  # (G,)
 
 
-def input_scale(observations: Array, achieved_goals: Array, is_visited: Array) -> InputScale:
-    """Root mean square of each dimension over demonstration states; 1 where a dimension is always zero.
+def input_scale(observations: Array, achieved_goals: Array, is_visited: Array, config: AgentConfig) -> InputScale:
+    """The scale of each dimension over demonstration states.
+
+    Standardised inputs have their mean as centre and their standard deviation as scale; others have centre 0 and the root mean square. A dimension
+    without extent has scale 1.
 
     Args:
       observations, achieved_goals: (..., D) and (..., G).
       is_visited: (...) bool, false for padding.
+      config: its `input_encoding` decides.
     """
 
-    def rms(values: Array) -> Array:
-        axes = tuple(range(values.ndim - 1))
-        mean_square = jnp.sum(jnp.where(is_visited[..., None], jnp.square(values), 0.0), axis=axes) / jnp.sum(is_visited)
-        return jnp.where(mean_square > 0.0, jnp.sqrt(mean_square), 1.0)
+    def moments(values: Array) -> tuple[Array, Array]:
+        axes, visited = tuple(range(values.ndim - 1)), is_visited[..., None]
+        count = jnp.sum(is_visited)
+        centre = jnp.zeros(values.shape[-1])
+        if config.input_encoding == "standardised":
+            centre = jnp.sum(jnp.where(visited, values, 0.0), axis=axes) / count
+        offset = values - centre.reshape((1,) * len(axes) + centre.shape)
+        mean_square = jnp.sum(jnp.where(visited, jnp.square(offset), 0.0), axis=axes) / count
+        return centre, jnp.where(mean_square > _LEAST_EXTENT**2, jnp.sqrt(mean_square), 1.0)
 
-    return InputScale(observation=rms(observations), goal=rms(achieved_goals))
+    observation_centre, observation = moments(observations)
+    goal_centre, goal = moments(achieved_goals)
+    return InputScale(observation=observation, goal=goal, observation_centre=observation_centre, goal_centre=goal_centre)
 
 
-def _encode(values: Array, scale: Array, config: AgentConfig) -> Array:
+def _encode(values: Array, centre: Array, scale: Array, config: AgentConfig) -> Array:
     if config.input_encoding == "raw":
         return values
-    scaled = values / scale.reshape((1,) * (values.ndim - 1) + scale.shape)
-    return jnp.concatenate([scaled, jnp.tanh(4.0 * scaled)], axis=-1)
+    leading = (1,) * (values.ndim - 1)
+    scaled = (values - centre.reshape(leading + centre.shape)) / scale.reshape(leading + scale.shape)
+    return jnp.concatenate([scaled, jnp.tanh(4.0 * scaled)], axis=-1) if config.input_encoding == "multiscale" else scaled
 
 
 def network_inputs(observation: Array, achieved_goal: Array, desired_goal: Array, scale: InputScale, config: AgentConfig) -> Array:
@@ -79,9 +96,9 @@ def network_inputs(observation: Array, achieved_goal: Array, desired_goal: Array
     step off" are far apart. With inputs as they are, small networks blur the two.
     """
     observation, achieved_goal, desired_goal = (
-        _encode(observation, scale.observation, config),
-        _encode(achieved_goal, scale.goal, config),
-        _encode(desired_goal, scale.goal, config),
+        _encode(observation, scale.observation_centre, scale.observation, config),
+        _encode(achieved_goal, scale.goal_centre, scale.goal, config),
+        _encode(desired_goal, scale.goal_centre, scale.goal, config),
     )
     if config.policy_input == "observation_goal":
         return jnp.concatenate([observation, desired_goal], axis=-1)
@@ -91,7 +108,8 @@ def network_inputs(observation: Array, achieved_goal: Array, desired_goal: Array
 def init(key: Array, config: AgentConfig, *, observation_dim: int, goal_dim: int, action_dim: int) -> AgentState:
     """A fresh agent; the target critics start as a copy of the critics."""
     key_actor, key_critics = jax.random.split(key)
-    unit = InputScale(observation=jnp.ones(observation_dim), goal=jnp.ones(goal_dim))
+    observation, goal = jnp.ones(observation_dim), jnp.ones(goal_dim)
+    unit = InputScale(observation=observation, goal=goal, observation_centre=observation, goal_centre=goal)
     input_dim = network_inputs(unit.observation, unit.goal, unit.goal, unit, config).shape[-1]
     actor = init_actor(key_actor, config, input_dim=input_dim, action_dim=action_dim)
     critics = init_critics(key_critics, config, input_dim=input_dim, action_dim=action_dim)
@@ -108,10 +126,10 @@ def init(key: Array, config: AgentConfig, *, observation_dim: int, goal_dim: int
     )
 
 
-def select_action(key: Array, actor: Params, inputs: Array, config: AgentConfig, *, action_dim: int, stochastic: bool) -> Array:
-    """Actions (B, A) in [-1, 1] at inputs (B, input_dim), see `network_inputs`: sampled from the policy, or its mode."""
+def select_action(actor: Params, inputs: Array, config: AgentConfig, *, action_dim: int, noise: Array | None = None) -> Array:
+    """Actions (B, A) in [-1, 1] at inputs (B, input_dim), see `network_inputs`: what standard normal noise (B, A) leads to, or the policy's mode."""
     distribution = apply_actor(actor, inputs.T, config, action_dim=action_dim)
-    return (distribution.sample(key)[0] if stochastic else distribution.mode).T
+    return (distribution.mode if noise is None else distribution.at(noise.T)[0]).T
 
 
 @struct.dataclass(kw_only=True)
@@ -150,6 +168,7 @@ class _Columns:
     reward: Array  # (B,)
     discount: Array  # (B,)
     is_demonstration: Array  # (B,) bool
+    obtained_return: Array | None  # (B,)
     noise: Array  # (A, B) standard normal, for the sampled action
     next_noise: Array  # (A, B) the same for the next action
 
@@ -211,6 +230,7 @@ def update(
         reward=batch.reward,
         discount=batch.discount,
         is_demonstration=batch.is_demonstration,
+        obtained_return=batch.obtained_return,
         noise=jax.random.normal(key_actor, action.shape),
         next_noise=jax.random.normal(key_next, action.shape),
     )
@@ -225,6 +245,10 @@ def update(
             entropy_bonus=-alpha * next_log_prob,
             num_dropped=config.num_critics * config.top_quantiles_to_drop_per_net,
         )
+        if config.clip_targets:
+            targets = jnp.clip(targets, 0.0, 1.0)
+        if block.obtained_return is not None:
+            targets = jnp.maximum(targets, block.obtained_return[None])
 
         def loss(critics: Params) -> tuple[Array, Metrics]:
             quantiles = apply_critics(critics, block.inputs, block.action, config)

@@ -24,17 +24,19 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from experts.recording import RecordableEnvironment
+from experts.by_hand import record_by_hand
+from experts.recording import Recording, on_host
+from experts.robosuite_arm import DeviceName
 from hindrl_jax import STARTED, __version__
 from hindrl_jax.config import SWEEPABLE, TrainConfig, without_effect
 from hindrl_jax.datasets import describe_demonstrations, load_demonstrations, read_states, save_demonstrations
 from hindrl_jax.errors import UserError
-from hindrl_jax.experiment import Result, fit, record_demonstrations
+from hindrl_jax.experiment import Result, check_trainable, fit, record_demonstrations
 from hindrl_jax.goals import epsilon_from_demonstrations, goal_table
 from hindrl_jax.presets import ORIGINAL_RULES, Preset, preset
 from hindrl_jax.registry import TASKS, checked, did_you_mean, make, task
 from hindrl_jax.runs import FROM_PYTHON, RunSpec, RunWriter, SweepWriter, draw_episode, load_run, read_spec, summarise
-from hindrl_jax.types import Episodes
+from hindrl_jax.types import Episodes, RestorableEnvironment
 
 _TYRO = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
 console = Console(highlight=False, soft_wrap=True)
@@ -259,6 +261,7 @@ def _parse_train(arguments: list[str], options_class: type[TrainOptions] = Train
         frozen=True,
     )
     parsed = _parse(namespace, arguments, program, COMMANDS[program.split()[1]].__doc__)
+    check_trainable(parsed.environment)
     options = parsed.options
     seeds = spec.seeds
     if options.seeds is not None or options.seed is not None:
@@ -345,6 +348,8 @@ class Eval:
     """Which episodes: equal numbers give equal ones."""
     stochastic: bool = False
     """Sample the actions instead of taking the mean ones."""
+    backend: str | None = None
+    """Simulate the environment with another of its back ends, for example robosuite, which plays one episode after the other."""
 
 
 def _eval(arguments: list[str]) -> None:
@@ -353,9 +358,20 @@ def _eval(arguments: list[str]) -> None:
     if options.episodes < 1:
         raise UserError(f"--episodes {options.episodes} is too few: play at least 1")
     run = load_run(options.directory)
-    outcomes = run.evaluate(episodes=options.episodes, key=_key(options.seed), stochastic=options.stochastic)
+    if options.backend is not None:
+        run = run.in_backend(options.backend)
+    columns = (TextColumn("{task.completed}/{task.total} episodes"), BarColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not on_host(run.spec.env)) as progress:
+        bar = progress.add_task("", total=options.episodes * len(run.spec.seeds))
+        outcomes = run.evaluate(
+            episodes=options.episodes,
+            key=_key(options.seed),
+            stochastic=options.stochastic,
+            report=lambda played: progress.update(bar, completed=played),
+        )
     table = Table("seed", "success", "length", box=box.SIMPLE_HEAD)
-    console.print(f"{run.spec.env.name}, {_count(options.episodes, 'episode')} per seed")
+    where = f" in {options.backend}" if options.backend else ""
+    console.print(f"{run.spec.env.name}{where}, {_count(options.episodes, 'episode')} per seed")
     for outcome in outcomes:
         table.add_row(str(outcome["seed"]), f"{outcome['success']:.1%}", f"{outcome['episode_length']:.1f}")
     console.print(table)
@@ -407,10 +423,12 @@ class Record:
     """Equal seeds give equal demonstrations."""
     overwrite: bool = False
     """Replace a file that is already there."""
+    device: DeviceName | None = None
+    """Play yourself, instead of the expert: steer the arm of a reach task in robosuite, in real time. Give yourself a long --horizon."""
 
 
 def _demos_record(arguments: list[str]) -> None:
-    """Record demonstrations with the task's expert."""
+    """Record demonstrations with the task's expert, or by hand."""
     name = _peek(arguments, "env") or "FixedGridPickAndPlace"
     entry = task(name)
     namespace = dataclasses.make_dataclass(
@@ -423,23 +441,37 @@ def _demos_record(arguments: list[str]) -> None:
         ],
         frozen=True,
     )
-    parsed = _parse(namespace, arguments, "hindrl demos record", "Record demonstrations with the task's expert.")
+    parsed = _parse(namespace, arguments, "hindrl demos record", _demos_record.__doc__)
     options, env = parsed.options, parsed.environment
     _key(options.seed)
     if options.out.exists() and not options.overwrite:
         raise UserError(f"{options.out} already exists: choose another --out, or replace it with --overwrite")
-    recording = record_demonstrations(env, options.demos, seed=options.seed, expert=parsed.expert)
+    if options.device is None:
+        expert = dataclasses.asdict(parsed.expert)
+        with console.status("recording") if on_host(env) else contextlib.nullcontext():  # it takes seconds for each episode
+            recording = record_demonstrations(env, options.demos, seed=options.seed, expert=parsed.expert)
+    else:
+        expert = {"device": options.device}
+        env, recording = _record_by_hand(env, options)
     save_demonstrations(
         options.out,
         recording.episodes,
         states=np.asarray(recording.states),
         env=env,
         env_args=dataclasses.asdict(env),
-        expert=dataclasses.asdict(parsed.expert),
+        expert=expert,
         overwrite=options.overwrite,
     )
     lengths = np.asarray(recording.episodes.lengths)
     console.print(f"wrote {options.out}: {_count(len(lengths), 'demonstration')} of {env.name}, mean length {lengths.mean():.1f} steps")
+
+
+def _record_by_hand(env: RestorableEnvironment, options: Record) -> tuple[RestorableEnvironment, Recording]:
+    """The environment in robosuite, and what a person did there."""
+    if "backend" not in (field.name for field in dataclasses.fields(env)):
+        raise UserError(f"--device {options.device} steers a robot's arm, and {env.name} has none: choose a reach environment, or drop --device")
+    env = dataclasses.replace(env, backend="robosuite")
+    return env, record_by_hand(_key(options.seed), env, options.device, options.demos, report=console.print)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -510,7 +542,7 @@ def _envs(arguments: list[str]) -> None:
     _parse(dataclasses.make_dataclass("Envs", []), arguments, "hindrl envs", "List the environments with their dimensions.")
     table = Table("environment", "observation", "goal", "action", "horizon", box=box.SIMPLE_HEAD)
     for entry in TASKS.values():
-        env: RecordableEnvironment = entry.environment()
+        env: RestorableEnvironment = entry.environment()
         table.add_row(env.name, *map(str, (env.observation_dim, env.goal_dim, env.action_dim, env.horizon)))
     console.print(table)
     for entry in TASKS.values():

@@ -42,6 +42,9 @@ class BatchConfig:
     """A goal counts as reached at distance <= epsilon; false gives the strict < of the thesis's formula and code."""
     terminate_on_relabel: bool = True
     """Reaching a relabelled goal ends the return; false bootstraps past it, as the thesis does, and values can exceed 1."""
+    bound_by_obtained_return: bool = False
+    """No target lies below the return that the row's own episode went on to obtain, which is a lower bound of the optimal value where neither
+    actions nor rewards are random (He et al., optimality tightening, 2017; Oh et al., self-imitation learning, 2018)."""
     timeouts_are_terminal: bool = False
     """Treat episodes cut by the horizon as terminated, as the original code does by mistake."""
 
@@ -109,6 +112,9 @@ class AgentConfig:
     """Adam's step size, for actor, critics and entropy coefficient."""
     final_learning_rate: float | None = None
     """Where the step size has moved, linearly, by the end of the run; None keeps it constant."""
+    clip_targets: bool = False
+    """Clip the critics' targets to [0, 1], which holds every return where the one reward of an episode is 1 and ends it (Andrychowicz et al.,
+    hindsight experience replay, 2017)."""
     num_critics: int = 2
     """Number of quantile critics."""
     num_quantiles: int = 25
@@ -131,8 +137,9 @@ class AgentConfig:
     """Squared distance to the demonstrated action (thesis), or its square root per row (original code)."""
     bc_action: Literal["mean", "sample"] = "mean"
     """Compare the policy's mean action (thesis) or a sampled one (original code) with the demonstrated action."""
-    input_encoding: Literal["raw", "multiscale"] = "multiscale"
-    """Networks see inputs as they are (thesis), or x and tanh(4 x), x being the input over its root mean square in the demonstrations."""
+    input_encoding: Literal["raw", "multiscale", "standardised"] = "multiscale"
+    """Networks see inputs as they are (thesis); x and tanh(4 x), x being the input over its root mean square in the demonstrations; or the input
+    less its mean there, over its standard deviation."""
     policy_input: Literal["observation_goal", "achieved_desired_observation"] = "observation_goal"
     """What the networks see; the second form repeats the achieved goal, as the thesis's framework does."""
 
@@ -170,6 +177,12 @@ class TrainConfig:
     """Gradient steps after each (vectorised) environment step."""
     learning_starts: int = 6_400
     """Environment steps with uniformly random actions before the first gradient step; at least one horizon in each environment is taken."""
+    noise_correlation: float = 0.0
+    """Correlation of the exploration noise of one step with that of the next, in each action dimension; 0 draws it anew at each step. Where a single
+    action moves little, as with a robot arm at 20 Hz, independent noise averages out before it explores anything."""
+    demo_reset_ratio: float = 0.0
+    """Share of training episodes that begin in a demonstrated state, drawn uniformly, with the steps that it had left (Nair et al., overcoming
+    exploration in reinforcement learning with demonstrations, 2018). Evaluations never do."""
     buffer_size: int = 500_000
     """Transitions that the replay holds."""
     eval_every: int = 16_000
@@ -187,6 +200,8 @@ class TrainConfig:
             self,
             **{name: (getattr(self, name) >= 1, "at least 1") for name in counts},
             learning_starts=(self.learning_starts >= 0, "0 or more"),
+            demo_reset_ratio=(0.0 <= self.demo_reset_ratio <= 1.0, "between 0 and 1"),
+            noise_correlation=(0.0 <= self.noise_correlation < 1.0, "in [0, 1)"),
         )
         if self.algo == "tqcfd" and self.batch.num_sampled_goals > 0:
             raise ValueError(f"tqcfd does not relabel, but num_sampled_goals = {self.batch.num_sampled_goals}: set it to 0, or choose hindrl")

@@ -116,7 +116,9 @@ def save_demonstrations(
       ValueError: `states` does not go with the table of episodes.
     """
     path = Path(path)
-    table = Episodes(**{field.name: np.asarray(getattr(demonstrations, field.name)) for field in dataclasses.fields(Episodes)})
+    table = Episodes(
+        **{name: np.asarray(getattr(demonstrations, name)) for name in (field.name for field in dataclasses.fields(Episodes)) if name != "states"}
+    )
     states = np.asarray(states)
     if states.ndim != 3 or states.shape[:2] != table.observations.shape[:2]:
         raise ValueError(f"states must have shape {(*table.observations.shape[:2], 'S')}, found {states.shape}")
@@ -181,7 +183,8 @@ def load_demonstrations(path: str | os.PathLike[str], env: Environment, *, num_d
 
     Args:
       path: a file written by `save_demonstrations`.
-      env: the environment to learn in. It must be the one recorded in the file, with equal arguments; only the horizon may differ.
+      env: the environment to learn in. It must be the one recorded in the file, with equal arguments; only the horizon may differ, and what
+        the environment itself names as `interchangeable`.
       num_demos: how many to take, the first of those that fit into the horizon; None takes all.
 
     Raises:
@@ -217,6 +220,7 @@ def load_demonstrations(path: str | os.PathLike[str], env: Environment, *, num_d
         lengths=np.array([len(demo.actions) for demo in demos], np.int32),
         terminated=np.array([demo.terminated for demo in demos], bool),
         desired_goals=np.stack([demo.desired_goal for demo in demos]),
+        states=padded([demo.states for demo in demos], env.horizon + 1),
     )
 
 
@@ -344,7 +348,8 @@ def _check_against_env(path: Path, header: _Header, demos: list[_Demonstration],
         raise UserError(f"{path}: was recorded in {header.env_name}, not in {env.name}; name a file of {env.name} or train in {header.env_name}")
     if dataclasses.is_dataclass(env):
         expected, missing = _plain(dataclasses.asdict(env)), "nothing"
-        for field in sorted((expected.keys() | header.env_kwargs.keys()) - {"horizon"}):
+        may_differ = {"horizon", *getattr(env, "interchangeable", ())}
+        for field in sorted((expected.keys() | header.env_kwargs.keys()) - may_differ):
             there, here = header.env_kwargs.get(field, missing), expected.get(field, missing)
             if there != here:
                 raise UserError(

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from experts.recording import RecordableEnvironment, Recording, record
+from experts.recording import Recording, on_host, record
 from hindrl_jax import train as training
 from hindrl_jax.agent import Metrics
 from hindrl_jax.config import SWEEPABLE, TrainConfig, sweepable_value, with_traced_values
@@ -21,7 +21,7 @@ from hindrl_jax.errors import UserError
 from hindrl_jax.registry import task
 from hindrl_jax.rollout import Evaluation
 from hindrl_jax.train import Guidance, TrainState
-from hindrl_jax.types import Array, Episodes
+from hindrl_jax.types import Array, Episodes, RestorableEnvironment, compiler_options
 
 SOLVED = 0.95
 FRESH_EPISODES = 100
@@ -67,7 +67,7 @@ class SeedSummary:
 class Result:
     """An experiment, finished or under way: S runs side by side."""
 
-    env: RecordableEnvironment
+    env: RestorableEnvironment
     configs: tuple[TrainConfig, ...]
     """(S,) the config of each run."""
     seeds: tuple[int, ...]
@@ -141,7 +141,7 @@ class Result:
         )
 
 
-def record_demonstrations(env: RecordableEnvironment, num_demos: int, *, seed: int = 0, expert: Any = None) -> Recording:
+def record_demonstrations(env: RestorableEnvironment, num_demos: int, *, seed: int = 0, expert: Any = None) -> Recording:
     """Records demonstrations with the task's own expert.
 
     Args:
@@ -157,8 +157,18 @@ def record_demonstrations(env: RecordableEnvironment, num_demos: int, *, seed: i
     return record(jax.random.fold_in(jax.random.key(seed), 1), env, expert, num_demos)
 
 
+def check_trainable(env: RestorableEnvironment) -> None:
+    """Makes sure that the environment can be stepped inside a compiled program.
+
+    Raises:
+      UserError: if not.
+    """
+    if on_host(env):
+        raise UserError(f"{env.name} cannot be trained in robosuite, which steps one arm outside JAX: train with backend closed_form or mjx")
+
+
 def fit(
-    env: RecordableEnvironment,
+    env: RestorableEnvironment,
     demonstrations: Episodes | Sequence[Episodes],
     config: TrainConfig | Sequence[TrainConfig],
     *,
@@ -181,8 +191,9 @@ def fit(
       The finished experiment. With several hosts, its agents are gathered on each of them, and the replay is not.
 
     Raises:
-      UserError: if the config does not fit the environment.
+      UserError: if the config does not fit the environment, or the environment cannot be trained in.
     """
+    check_trainable(env)
     if not seeds or not all(0 <= seed < 2**32 for seed in seeds):
         raise UserError(f"seeds = {list(seeds)} is not usable: give at least one whole number from 0 to {2**32 - 1}")
     tables = _demonstrations_per_seed(demonstrations, seeds, env)
@@ -242,7 +253,7 @@ def _one_for_each(seeds: Sequence[int], given: Any, kind: type[Any], noun: str) 
     return items
 
 
-def _demonstrations_per_seed(demonstrations: Episodes | Sequence[Episodes], seeds: Sequence[int], env: RecordableEnvironment) -> Episodes:
+def _demonstrations_per_seed(demonstrations: Episodes | Sequence[Episodes], seeds: Sequence[int], env: RestorableEnvironment) -> Episodes:
     """Stacks one table per seed (numpy leaves (S, ...)), having checked that the tables fit the seeds and the environment."""
     tables = _one_for_each(seeds, demonstrations, Episodes, "tables of demonstrations")
     expected = (env.horizon + 1, env.observation_dim, env.horizon, env.action_dim)
@@ -276,7 +287,7 @@ def _swept_fields(configs: Sequence[TrainConfig]) -> list[str]:
 class _Programs:
     """The compiled programs of one experiment, mapped over its runs. Each takes the swept values (S,) of the config as its last argument."""
 
-    def __init__(self, env: RecordableEnvironment, configs: Sequence[TrainConfig], demonstrations: Episodes):
+    def __init__(self, env: RestorableEnvironment, configs: Sequence[TrainConfig], demonstrations: Episodes):
         config = configs[0]
         cloning = config.algo == "bc"
         self.warm_up, per_iteration = (0, 1) if cloning else (training.warm_up_iterations(env, config), config.num_envs)
@@ -312,7 +323,7 @@ class _Programs:
         with ThreadPoolExecutor() as pool:
 
             def compiled(traced: Any, options: dict[str, Any] | None = None) -> Future[Any]:
-                return pool.submit(traced.lower().compile, options)
+                return pool.submit(traced.lower().compile, compiler_options(env) | (options or {}))
 
             values = shapes_on(self.values, self.mesh)
             seeds = jax.ShapeDtypeStruct((len(configs),), np.uint32)

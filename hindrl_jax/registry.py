@@ -10,9 +10,11 @@ from types import ModuleType
 from typing import Any
 
 from envs.grid import FixedGridPickAndPlace, GridPickAndPlace
+from envs.reach import FixedParameterizedReach, ParameterizedReach
 from experts.grid import GridExpert
-from experts.recording import RecordableEnvironment
+from experts.reach import ReachExpert
 from hindrl_jax.errors import UserError
+from hindrl_jax.types import RestorableEnvironment
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +36,8 @@ TASKS: dict[str, Task] = {
     for task in (
         Task(GridPickAndPlace, GridExpert, "envs.grid.viewer", "objects, agent and goal anywhere on the grid (thesis 3.1.1)"),
         Task(FixedGridPickAndPlace, GridExpert, "envs.grid.viewer", "each of them within a small box of its own (thesis 3.1.2)"),
+        Task(ParameterizedReach, ReachExpert, "envs.reach.viewer", "a Panda arm reaches random poses in order (thesis 3.2.1)"),
+        Task(FixedParameterizedReach, ReachExpert, "envs.reach.viewer", "the same, with poses that never change (thesis 3.2.2)"),
     )
 }
 
@@ -49,7 +53,7 @@ def task(name: str) -> Task:
     return TASKS[name]
 
 
-def make(name: str, **arguments: Any) -> RecordableEnvironment:
+def make(name: str, **arguments: Any) -> RestorableEnvironment:
     """Builds an environment by name.
 
     Args:
@@ -67,7 +71,7 @@ def make(name: str, **arguments: Any) -> RecordableEnvironment:
     return checked(lambda: environment(**arguments))
 
 
-def viewer(env: RecordableEnvironment) -> ModuleType:
+def viewer(env: RestorableEnvironment) -> ModuleType:
     """The module that draws this environment."""
     return importlib.import_module(task(env.name).viewer_module)
 

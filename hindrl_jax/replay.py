@@ -188,7 +188,15 @@ def transitions(
         next_observation=jnp.take_along_axis(next_observations, last[..., None], axis=1)[:, 0],
         desired_goal=jnp.where(relabelled[:, None], new_goals, episodes.desired_goals[rows]),
         is_demonstration=jnp.full(rows.shape, is_demonstration),
+        obtained_return=_obtained_return(episodes, rows, steps, relabelled, config) if config.bound_by_obtained_return else None,
     )
+
+
+def _obtained_return(episodes: Episodes, rows: Array, steps: Array, relabelled: Array, config: BatchConfig) -> Array:
+    """(B,) discounted reward at the end of each row's own episode, seen from its step; 0 for relabelled rows."""
+    last = episodes.lengths[rows] - 1
+    reward = episodes.rewards[rows, last] * config.gamma ** (last - steps).astype(jnp.float32)
+    return jnp.where(relabelled, 0.0, reward)
 
 
 def num_demo_rows(env_steps: Array, config: BatchConfig) -> Array:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from hindrl_jax.goals import GoalTable, sample_goals
+from hindrl_jax.randomness import uniform_index
 from hindrl_jax.types import Array, Environment, TimeStep, action_to_env, tree_where
 
 Act = Callable[[Array, Array, Array], Array]
@@ -25,29 +26,70 @@ class RolloutState:
     desired_goal: Array  # (E, G), the behavioural goals
 
 
-def reset(key: Array, env: Environment, behavioural_goals: GoalTable, num_envs: int) -> RolloutState:
-    """Starts `num_envs` episodes, each with a goal drawn from the table (thesis algorithm 5)."""
+@struct.dataclass(kw_only=True)
+class StartTable:
+    """Demonstrated states in which an episode may begin: the first `count` rows."""
+
+    states: Array  # (M, S) as vectors, see `RestorableEnvironment`; rows from `count` on are padding
+    count: Array  # () int32
+
+
+def start_table(states: Array, lengths: Array) -> StartTable:
+    """All demonstrated states but the last of each demonstration, where nothing is left to do.
+
+    Args:
+      states: (N, T + 1, S), padded.
+      lengths: (N,) int32 number of transitions.
+    """
+    usable = (jnp.arange(states.shape[1])[None] < lengths[:, None]).reshape(-1)
+    order = jnp.argsort(~usable, stable=True)
+    return StartTable(states=states.reshape(-1, states.shape[-1])[order], count=jnp.sum(usable))
+
+
+def reset(
+    key: Array,
+    env: Environment,
+    behavioural_goals: GoalTable,
+    num_envs: int,
+    *,
+    starts: StartTable | None = None,
+    demo_reset_ratio: float = 0.0,
+) -> RolloutState:
+    """Starts `num_envs` episodes, each with a goal drawn from the table (thesis algorithm 5).
+
+    Args:
+      key: random key.
+      env: static; a `RestorableEnvironment` if there are `starts`.
+      behavioural_goals: the table.
+      num_envs: E.
+      starts: with probability `demo_reset_ratio` an episode begins in one of these states instead of the environment's own.
+    """
     key_env, key_goal = jax.random.split(key)
     env_state, observation = jax.vmap(env.reset)(jax.random.split(key_env, num_envs))
+    if starts is not None:
+        key_choice, key_start, key_states = jax.random.split(jax.random.fold_in(key, 1), 3)
+        vectors = starts.states[uniform_index(key_start, (num_envs,), starts.count)]
+        demonstrated = jax.vmap(env.vector_to_state)(jax.random.split(key_states, num_envs), vectors)
+        chosen = jax.random.bernoulli(key_choice, demo_reset_ratio, (num_envs,))
+        env_state = tree_where(chosen, demonstrated, env_state)
+        observation = tree_where(chosen, jax.vmap(env.observe)(demonstrated), observation)
     return RolloutState(env_state=env_state, observation=observation, desired_goal=sample_goals(key_goal, behavioural_goals, num_envs))
 
 
-def step(key: Array, rollout: RolloutState, action: Array, env: Environment, behavioural_goals: GoalTable) -> tuple[RolloutState, TimeStep]:
-    """Steps every environment and starts a new episode where one has ended.
+def step(rollout: RolloutState, restarted: RolloutState, action: Array, env: Environment) -> tuple[RolloutState, TimeStep]:
+    """Steps every environment, and goes on from a new episode where one has ended.
 
     Args:
-      key: used by the new episodes.
       rollout: E environments.
+      restarted: E new episodes from `reset`; those that are not needed are dropped.
       action: (E, A) in [-1, 1].
       env: static.
-      behavioural_goals: goals for the new episodes.
 
     Returns:
       The new state, and the time steps (E, ...) before the resets: their observation is the true next one.
     """
     env_state, time_step = jax.vmap(env.step)(rollout.env_state, action_to_env(action, env))
     continued = rollout.replace(env_state=env_state, observation=time_step.observation)
-    restarted = reset(key, env, behavioural_goals, action.shape[0])
     return tree_where(time_step.terminated | time_step.truncated, restarted, continued), time_step
 
 

@@ -18,7 +18,7 @@ import re
 import resource
 import sys
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -27,16 +27,16 @@ import jax.numpy as jnp
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from experts.recording import RecordableEnvironment, play
+from experts.recording import on_host, player
 from hindrl_jax import plots, rollout
 from hindrl_jax import train as training
 from hindrl_jax.agent import InputScale
 from hindrl_jax.config import TrainConfig, with_values
 from hindrl_jax.errors import UserError
 from hindrl_jax.experiment import Result, Row
-from hindrl_jax.goals import GoalTable
-from hindrl_jax.registry import did_you_mean, make, viewer
-from hindrl_jax.types import action_to_env
+from hindrl_jax.goals import GoalTable, sample_goals
+from hindrl_jax.registry import checked, did_you_mean, make, viewer
+from hindrl_jax.types import RestorableEnvironment, action_to_env, compiler_options
 
 CONFIG, METRICS, SUMMARY, PARAMETERS = "config.json", "metrics.csv", "summary.json", "parameters.npz"
 CURVE, EPISODE = "curve.png", "episode.gif"
@@ -50,7 +50,7 @@ _ROW_FIELDS = [field.name for field in dataclasses.fields(Row) if field.name != 
 class RunSpec:
     """Everything that a run was asked to do."""
 
-    env: RecordableEnvironment
+    env: RestorableEnvironment
     config: TrainConfig
     demos: str
     """A number of demonstrations to record for each seed, or the path of a file."""
@@ -301,21 +301,77 @@ class Run:
     scale: InputScale
     """Leaves (S, ...)."""
 
-    def evaluate(self, *, episodes: int = 100, key: jax.Array | None = None, stochastic: bool = False) -> list[dict[str, float]]:
-        """Plays fresh episodes with each seed's policy: a list of {seed, success, episode_length}, in order of the seeds."""
+    def in_backend(self, backend: str) -> Run:
+        """The same policies, with the task simulated by another back end.
+
+        Raises:
+          UserError: if the task has no such back end.
+        """
+        env = self.spec.env
+        if "backend" not in (field.name for field in dataclasses.fields(env)):
+            raise UserError(f"{env.name} has one back end only: drop the choice of {backend!r}")
+        return dataclasses.replace(self, spec=dataclasses.replace(self.spec, env=checked(lambda: dataclasses.replace(env, backend=backend))))
+
+    def evaluate(
+        self,
+        *,
+        episodes: int = 100,
+        key: jax.Array | None = None,
+        stochastic: bool = False,
+        report: Callable[[int], None] = lambda played: None,
+    ) -> list[dict[str, float]]:
+        """Plays fresh episodes with each seed's policy: a list of {seed, success, episode_length}, in order of the seeds.
+
+        Args:
+          episodes: how many, per seed.
+          key: which.
+          stochastic: sample the actions.
+          report: called with the number of episodes played so far, all seeds together, where they are played one by one: in robosuite.
+        """
         keys = jax.random.split(jax.random.key(0) if key is None else key, len(self.spec.seeds))
-
-        @jax.jit
-        @jax.vmap
-        def play_episodes(key: jax.Array, actor: Any, goals: GoalTable, scale: InputScale) -> Any:
-            act = training.make_policy(actor, scale, self.spec.env, self.spec.config, stochastic=stochastic)
-            return rollout.evaluate(key, self.spec.env, goals, act, episodes)
-
-        result = jax.device_get(play_episodes(keys, self.policies, self.behavioural_goals, self.scale))
+        if on_host(self.spec.env):
+            result = self._play_one_by_one(keys, episodes, stochastic=stochastic, report=report)
+        else:
+            result = self._play_side_by_side(keys, episodes, stochastic=stochastic)
         return [
             {"seed": seed, "success": float(result.success[i].mean()), "episode_length": float(result.length[i].mean())}
             for i, seed in enumerate(self.spec.seeds)
         ]
+
+    def _play_side_by_side(self, keys: jax.Array, episodes: int, *, stochastic: bool) -> rollout.Evaluation:
+        """All episodes of all seeds in one compiled program; leaves (S, episodes)."""
+        env, config = self.spec.env, self.spec.config
+
+        @jax.vmap
+        def play_episodes(key: jax.Array, actor: Any, goals: GoalTable, scale: InputScale) -> rollout.Evaluation:
+            return rollout.evaluate(key, env, goals, training.make_policy(actor, scale, env, config, stochastic=stochastic), episodes)
+
+        program = jax.jit(play_episodes, compiler_options=compiler_options(env))
+        return jax.device_get(program(keys, self.policies, self.behavioural_goals, self.scale))
+
+    def _play_one_by_one(self, keys: jax.Array, episodes: int, *, stochastic: bool, report: Callable[[int], None]) -> rollout.Evaluation:
+        """One episode after the other; leaves (S, episodes)."""
+        success, length = (np.zeros((len(keys), episodes), kind) for kind in (bool, np.int32))
+        for i, key in enumerate(keys):
+            play_episode = player(self.spec.env, self._act(i, stochastic=stochastic, any_goal=True), 1)
+            for n, key_episode in enumerate(jax.random.split(key, episodes)):
+                outcome = play_episode(key_episode).episodes
+                success[i, n], length[i, n] = outcome.terminated[0], outcome.lengths[0]
+                report(i * episodes + n + 1)
+        return rollout.Evaluation(success=success, length=length)
+
+    def _act(self, index: int, *, stochastic: bool, any_goal: bool) -> Callable[[jax.Array, Any, jax.Array], jax.Array]:
+        """The policy of one seed, for `player`. It aims at the first behavioural goal, or with `any_goal` at one drawn for the episode."""
+        env = self.spec.env
+        actor, goals, scale = jax.tree.map(lambda leaf: leaf[index], (self.policies, self.behavioural_goals, self.scale))
+        policy = training.make_policy(actor, scale, env, self.spec.config, stochastic=stochastic)
+
+        def act(key: jax.Array, state: Any, observation: jax.Array) -> jax.Array:
+            # The state's key is constant within an episode, and so is the goal drawn with it.
+            goal = sample_goals(jax.random.fold_in(state.key, 0), goals, 1) if any_goal else goals.goals[:1]
+            return action_to_env(policy(key, observation[None], goal)[0], env)
+
+        return act
 
     def render(self, path: Path, *, seed: int | None = None, key: jax.Array | None = None, stochastic: bool = False) -> bool:
         """Films one fresh episode of one seed's policy (the first seed's by default); returns whether it solved the task.
@@ -329,25 +385,19 @@ class Run:
         Raises:
           UserError: if the run has no such seed.
         """
-        env, config = self.spec.env, self.spec.config
+        env = self.spec.env
         _check_drawable(path)
         seed = self.spec.seeds[0] if seed is None else seed
         if seed not in self.spec.seeds:
             raise UserError(f"{self.path} has no seed {seed}: choose one of {', '.join(map(str, self.spec.seeds))}")
-        index = self.spec.seeds.index(seed)
-        actor, goals, scale = jax.tree.map(lambda leaf: leaf[index], (self.policies, self.behavioural_goals, self.scale))
-        policy = training.make_policy(actor, scale, env, config, stochastic=stochastic)
-
-        def act(key: jax.Array, state: Any, observation: jax.Array) -> jax.Array:
-            return action_to_env(policy(key, observation[None], goals.goals[:1])[0], env)
-
-        recording = jax.jit(lambda key: play(key, env, act, 1))(jax.random.key(0) if key is None else key)
+        act = self._act(self.spec.seeds.index(seed), stochastic=stochastic, any_goal=False)
+        recording = player(env, act, 1)(jax.random.key(0) if key is None else key)
         episode = jax.tree.map(lambda leaf: leaf[0], recording)
         draw_episode(path, env, np.asarray(episode.states[: int(episode.episodes.lengths) + 1]))
         return bool(episode.episodes.terminated)
 
 
-def draw_episode(path: Path, env: RecordableEnvironment, states: np.ndarray) -> None:
+def draw_episode(path: Path, env: RestorableEnvironment, states: np.ndarray) -> None:
     """Draws an episode from its states (length + 1, S): a GIF of all of them, or a PNG of the last.
 
     Raises:
@@ -396,11 +446,18 @@ def load_run(path: str | os.PathLike[str]) -> Run:
         with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             tree = unflatten_dict({name: jnp.asarray(archive[name]) for name in archive.files}, sep="/")
         goals = GoalTable(goals=tree["behavioural_goals"]["goals"], count=tree["behavioural_goals"]["count"])
-        scale = InputScale(observation=tree["input_scale"]["observation"], goal=tree["input_scale"]["goal"])
+        scale = _input_scale(tree["input_scale"])
         policies = tree["policy"]
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise UserError(f"{file} is damaged ({str(error).splitlines()[0]}): train again") from error
     return Run(path=path, spec=spec, policies=policies, behavioural_goals=goals, scale=scale)
+
+
+def _input_scale(saved: dict[str, jax.Array]) -> InputScale:
+    """The scale as it was saved. Runs from before inputs had a centre have theirs at 0."""
+    observation, goal = saved["observation"], saved["goal"]
+    centres = [saved.get(f"{name}_centre", jnp.zeros_like(saved[name])) for name in ("observation", "goal")]
+    return InputScale(observation=observation, goal=goal, observation_centre=centres[0], goal_centre=centres[1])
 
 
 def _save_parameters(path: Path, result: Result) -> None:
@@ -412,7 +469,7 @@ def _save_parameters(path: Path, result: Result) -> None:
         "log_alpha": agent.log_alpha,
         "epsilon": result.guidance.epsilon,
         "behavioural_goals": {"goals": goals.goals, "count": goals.count},
-        "input_scale": {"observation": scale.observation, "goal": scale.goal},
+        "input_scale": {field.name: getattr(scale, field.name) for field in dataclasses.fields(scale)},
     }
     temporary = path.with_suffix(".partial.npz")
     np.savez(temporary, **{name: np.asarray(leaf) for name, leaf in flatten_dict(tree, sep="/").items()})

@@ -7,6 +7,7 @@ over its gradient steps.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -17,10 +18,11 @@ from hindrl_jax import agent as agents
 from hindrl_jax import goals, replay, rollout
 from hindrl_jax.agent import AgentState, InputScale, Metrics
 from hindrl_jax.config import TrainConfig
+from hindrl_jax.errors import UserError
 from hindrl_jax.goals import GoalTable
 from hindrl_jax.randomness import uniform_index
 from hindrl_jax.replay import ReplayState
-from hindrl_jax.rollout import Act, Evaluation, RolloutState
+from hindrl_jax.rollout import Act, Evaluation, RolloutState, StartTable
 from hindrl_jax.types import Array, Environment, Episodes, Transition, action_to_env
 
 
@@ -33,6 +35,7 @@ class Guidance:
     behavioural_goals: GoalTable  # goals for rollouts
     epsilon: Array  # (G,) half-width of the goal box
     scale: InputScale  # typical size of the networks' inputs
+    starts: StartTable | None  # demonstrated states in which training episodes may begin; None if none do
 
 
 @struct.dataclass(kw_only=True)
@@ -42,13 +45,24 @@ class TrainState:
     agent: AgentState
     replay: ReplayState
     rollout: RolloutState
+    exploration: Array  # (E, A) the standard normal noise behind the latest actions
     key: Array
     env_steps: Array  # () int32
     updates: Array  # () int32
 
 
 def guidance(demonstrations: Episodes, env: Environment, config: TrainConfig) -> Guidance:
-    """Epsilon (thesis eq. 4.7), goal database, filter (algorithm 6) and behavioural goals (algorithm 5) from demonstrations (N, ...)."""
+    """Epsilon (thesis eq. 4.7), goal database, filter (algorithm 6) and behavioural goals (algorithm 5) from demonstrations (N, ...).
+
+    Raises:
+      UserError: if training episodes are to begin in demonstrated states, and the demonstrations come without their states.
+    """
+    starts = None
+    if config.demo_reset_ratio > 0.0:
+        if demonstrations.states is None:
+            raise UserError(f"demo_reset_ratio = {config.demo_reset_ratio} needs the states of the demonstrations: give them, or set it to 0")
+        starts = rollout.start_table(demonstrations.states, demonstrations.lengths)
+    demonstrations = demonstrations.replace(states=None)
     goal_config, inclusive = config.goal, config.batch.inclusive_goal_test
     if goal_config.misalign_demo_actions:
         demonstrations = demonstrations.replace(
@@ -79,7 +93,8 @@ def guidance(demonstrations: Episodes, env: Environment, config: TrainConfig) ->
         ),
         behavioural_goals=behavioural_goals,
         epsilon=epsilon,
-        scale=agents.input_scale(demonstrations.observations, achieved, goals.is_visited(lengths, achieved.shape[1])),
+        scale=agents.input_scale(demonstrations.observations, achieved, goals.is_visited(lengths, achieved.shape[1]), config.agent),
+        starts=starts,
     )
 
 
@@ -95,11 +110,17 @@ def init(key: Array, data: Guidance, env: Environment, config: TrainConfig) -> T
     return TrainState(
         agent=agents.init(key_agent, config.agent, **dims),
         replay=replay.init(num_envs=config.num_envs, capacity=smallest if config.algo == "bc" else config.buffer_size, horizon=env.horizon, **dims),
-        rollout=rollout.reset(key_rollout, env, data.behavioural_goals, config.num_envs),
+        rollout=_new_episodes(key_rollout, data, env, config),
+        exploration=jnp.zeros((config.num_envs, env.action_dim)),
         key=key_train,
         env_steps=jnp.asarray(0),
         updates=jnp.asarray(0),
     )
+
+
+def _new_episodes(key: Array, data: Guidance, env: Environment, config: TrainConfig) -> RolloutState:
+    goals, ratio = data.behavioural_goals, config.demo_reset_ratio
+    return rollout.reset(key, env, goals, config.num_envs, starts=data.starts, demo_reset_ratio=ratio)
 
 
 def warm_up_iterations(env: Environment, config: TrainConfig) -> int:
@@ -112,17 +133,31 @@ def make_policy(actor: Any, scale: InputScale, env: Environment, config: TrainCo
 
     def act(key: Array, observation: Array, desired_goal: Array) -> Array:
         inputs = agents.network_inputs(observation, env.achieved_goal(observation), desired_goal, scale, config.agent)
-        return agents.select_action(key, actor, inputs, config.agent, action_dim=env.action_dim, stochastic=stochastic)
+        noise = _normal(key, observation.shape[0], env) if stochastic else None
+        return agents.select_action(actor, inputs, config.agent, action_dim=env.action_dim, noise=noise)
 
     return act
 
 
-def _interact(key: Array, state: TrainState, data: Guidance, env: Environment, act: Act) -> TrainState:
-    """One step of every environment, stored in the replay."""
-    key_act, key_reset = jax.random.split(key)
+def _normal(key: Array, num_rows: int, env: Environment) -> Array:
+    return jax.random.normal(key, (env.action_dim, num_rows)).T
+
+
+def _explore(key: Array, state: TrainState, env: Environment, config: TrainConfig) -> Array:
+    """The next noise (E, A): standard normal at each step, correlated from one step to the next by `noise_correlation` (an AR(1) process)."""
+    fresh, kept = _normal(key, state.exploration.shape[0], env), config.noise_correlation
+    return kept * state.exploration + (1.0 - kept**2) ** 0.5 * fresh
+
+
+def _interact(
+    key: Array, state: TrainState, data: Guidance, env: Environment, config: TrainConfig, act: Callable[[Array, RolloutState], Array]
+) -> TrainState:
+    """One step of every environment, stored in the replay; `act` turns noise (E, A) and the rollout into actions (E, A)."""
+    key_noise, key_reset = jax.random.split(key)
     before = state.rollout
-    action = act(key_act, before.observation, before.desired_goal)
-    after, time_step = rollout.step(key_reset, before, action, env, data.behavioural_goals)
+    noise = _explore(key_noise, state, env, config)
+    action = act(noise, before)
+    after, time_step = rollout.step(before, _new_episodes(key_reset, data, env, config), action, env)
     stored = replay.add(
         state.replay,
         observation=before.observation,
@@ -133,18 +168,18 @@ def _interact(key: Array, state: TrainState, data: Guidance, env: Environment, a
         terminated=time_step.terminated,
         truncated=time_step.truncated,
     )
-    return state.replace(replay=stored, rollout=after, env_steps=state.env_steps + action.shape[0])
+    return state.replace(replay=stored, rollout=after, exploration=noise, env_steps=state.env_steps + action.shape[0])
 
 
 def collect(state: TrainState, data: Guidance, *, env: Environment, config: TrainConfig, num_iterations: int) -> TrainState:
     """Fills the replay by uniformly random actions: `num_iterations` steps of every environment."""
 
-    def uniform(key: Array, observation: Array, desired_goal: Array) -> Array:
-        return jax.random.uniform(key, (observation.shape[0], env.action_dim), minval=-1.0, maxval=1.0)
+    def uniform(noise: Array, before: RolloutState) -> Array:
+        return 2.0 * jax.scipy.stats.norm.cdf(noise) - 1.0
 
     def iteration(state: TrainState, _: None) -> tuple[TrainState, None]:
         key, key_interact = jax.random.split(state.key)
-        return _interact(key_interact, state.replace(key=key), data, env, uniform), None
+        return _interact(key_interact, state.replace(key=key), data, env, config, uniform), None
 
     return jax.lax.scan(iteration, state, length=num_iterations)[0]
 
@@ -165,8 +200,14 @@ def learn(state: TrainState, data: Guidance, *, env: Environment, config: TrainC
 
     def iteration(state: TrainState, _: None) -> tuple[TrainState, Metrics]:
         key, key_interact, key_batch, key_updates = jax.random.split(state.key, 4)
-        act = make_policy(state.agent.actor, data.scale, env, config, stochastic=True)
-        state = _interact(key_interact, state.replace(key=key), data, env, act)
+        actor = state.agent.actor
+
+        def act(noise: Array, before: RolloutState) -> Array:
+            achieved = env.achieved_goal(before.observation)
+            inputs = agents.network_inputs(before.observation, achieved, before.desired_goal, data.scale, config.agent)
+            return agents.select_action(actor, inputs, config.agent, action_dim=env.action_dim, noise=noise)
+
+        state = _interact(key_interact, state.replace(key=key), data, env, config, act)
         draw = functools.partial(
             replay.sample_batch,
             replay=state.replay,

@@ -41,6 +41,7 @@ class Episodes:
     lengths: Array  # (N,) int32, number of transitions, 1 <= length <= T
     terminated: Array  # (N,) bool, whether the last transition ended the task (rather than the horizon)
     desired_goals: Array  # (N, G) float32, the goal that the episode was acted under
+    states: Array | None = None  # (N, T + 1, S) environment states as vectors, repeated after the end; None where they are not kept
 
 
 @struct.dataclass(kw_only=True)
@@ -54,6 +55,7 @@ class Transition:
     next_observation: Array  # (B, D)
     desired_goal: Array  # (B, G)
     is_demonstration: Array  # (B,) bool
+    obtained_return: Array | None = None  # (B,), the discounted return that the episode went on to obtain; None where it is not used
 
 
 @runtime_checkable
@@ -76,12 +78,12 @@ class Environment(Protocol):
     def action_dim(self) -> int: ...
 
     @property
-    def action_low(self) -> float:
-        """Lower bound of every action dimension, in the environment's own units."""
+    def action_low(self) -> Any:
+        """Lower bound of the actions in the environment's own units: a number for all dimensions, or (A,)."""
 
     @property
-    def action_high(self) -> float:
-        """Upper bound of every action dimension, in the environment's own units."""
+    def action_high(self) -> Any:
+        """Upper bound, likewise."""
 
     def reset(self, key: Array) -> tuple[Any, Array]:
         """Starts an episode: key -> (state, observation (D,))."""
@@ -96,14 +98,44 @@ class Environment(Protocol):
         """(G,) one fixed goal that stands for "the task is solved"."""
 
 
+def compiler_options(env: Environment) -> dict[str, Any]:
+    """Options that XLA needs for programs that step this environment, for `jax.jit` or `compile`; most environments need none."""
+    return getattr(env, "compiler_options", {})
+
+
+@runtime_checkable
+class RestorableEnvironment(Environment, Protocol):
+    """An environment whose state can be written down as a vector and read back: to be drawn, or to begin an episode there."""
+
+    @property
+    def state_dim(self) -> int:
+        """S, the length of the vector."""
+
+    def observe(self, state: Any) -> Array:
+        """The observation (D,) of a state."""
+
+    def state_to_vector(self, state: Any) -> Array:
+        """(S,) float32: all of the state but its key."""
+
+    def vector_to_state(self, key: Array, vector: Array) -> Any:
+        """The state of a vector (S,), with this key."""
+
+
 def action_to_env(action: Array, env: Environment) -> Array:
-    """Maps policy actions in [-1, 1] to the environment's own units, any leading axes."""
-    return env.action_low + (action + 1.0) * (0.5 * (env.action_high - env.action_low))
+    """Maps policy actions (..., A) in [-1, 1] to the environment's own units."""
+    low, high = _action_bounds(action, env)
+    return low + (action + 1.0) * (0.5 * (high - low))
 
 
 def action_from_env(action: Array, env: Environment) -> Array:
-    """Maps actions in the environment's own units to the policy's [-1, 1]; the inverse of `action_to_env`."""
-    return 2.0 * (action - env.action_low) / (env.action_high - env.action_low) - 1.0
+    """Maps actions (..., A) in the environment's own units to the policy's [-1, 1]; the inverse of `action_to_env`."""
+    low, high = _action_bounds(action, env)
+    return 2.0 * (action - low) / (high - low) - 1.0
+
+
+def _action_bounds(action: Array, env: Environment) -> tuple[Array, Array]:
+    low, high = (jnp.broadcast_to(jnp.asarray(bound, action.dtype), action.shape) for bound in (env.action_low, env.action_high))
+    return low, high
 
 
 def tree_where(condition: Array, if_true: Any, if_false: Any) -> Any:

@@ -54,7 +54,7 @@ def make_batch(*, action, reward, discount, observation=None, next_observation=N
     )
 
 
-UNIT_SCALE = agents.InputScale(observation=jnp.ones(2), goal=jnp.ones(1))
+UNIT_SCALE = agents.InputScale(observation=jnp.ones(2), goal=jnp.ones(1), observation_centre=jnp.zeros(2), goal_centre=jnp.zeros(1))
 
 
 def inputs_of(observation, config):
@@ -103,7 +103,7 @@ def values(state, observation, action):
 @jax.jit
 def mean_action(state, observation):
     inputs = inputs_of(observation, CONFIG)
-    return agents.select_action(jax.random.key(0), state.actor, inputs, CONFIG, action_dim=1, stochastic=False)
+    return agents.select_action(state.actor, inputs, CONFIG, action_dim=1)
 
 
 ACTIONS = np.linspace(-1.0, 1.0, B, dtype=np.float32)[:, None]
@@ -312,13 +312,14 @@ def test_mean_over_blocks_is_the_mean_over_the_batch():
         reward=jnp.arange(12.0),
         discount=jnp.ones(12),
         is_demonstration=jnp.arange(12) < 5,
+        obtained_return=jnp.asarray(rng.uniform(size=12), jnp.float32),
         noise=jnp.zeros((2, 12)),
         next_noise=jnp.zeros((2, 12)),
     )
 
     def function(block):
         # Columns stay together: a product of different fields would show a mixture.
-        product = block.inputs[0] * block.action[1] * block.reward * block.is_demonstration
+        product = block.inputs[0] * block.action[1] * block.reward * block.is_demonstration * block.obtained_return
         return {"mean": jnp.mean(product), "matrix": block.inputs @ block.action.T / block.reward.shape[0]}
 
     expected = function(columns)

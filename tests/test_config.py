@@ -65,6 +65,7 @@ BAD = [
     (BatchConfig, "gamma", [0.0, 1.01, float("inf")]),
     (BatchConfig, "inclusive_goal_test", [1, "yes"]),
     (BatchConfig, "terminate_on_relabel", [0]),
+    (BatchConfig, "bound_by_obtained_return", [1, "yes"]),
     (BatchConfig, "timeouts_are_terminal", [None]),
     (GoalConfig, "m", [-1, 0.5]),
     (GoalConfig, "k", [-0.1, float("nan")]),
@@ -77,6 +78,7 @@ BAD = [
     (AgentConfig, "layer_norm", [1]),
     (AgentConfig, "network_precision", ["float16", 32]),
     (AgentConfig, "learning_rate", [0.0, -1e-3, float("inf"), "1e-3"]),
+    (AgentConfig, "clip_targets", [1.0]),
     (AgentConfig, "num_critics", [0]),
     (AgentConfig, "num_quantiles", [0]),
     (AgentConfig, "top_quantiles_to_drop_per_net", [-1, AgentConfig().num_quantiles]),
@@ -89,13 +91,15 @@ BAD = [
     (AgentConfig, "bc_weight", [-1.0]),
     (AgentConfig, "bc_loss", ["l2"]),
     (AgentConfig, "bc_action", ["mode"]),
-    (AgentConfig, "input_encoding", ["scaled"]),
+    (AgentConfig, "input_encoding", ["scaled", "standardized"]),
     (AgentConfig, "policy_input", ["observation"]),
     (TrainConfig, "algo", ["HinDRL", "sac"]),
     (TrainConfig, "steps", [0, 1e5]),
     (TrainConfig, "num_envs", [0]),
     (TrainConfig, "updates_per_iteration", [0]),
     (TrainConfig, "learning_starts", [-1]),
+    (TrainConfig, "noise_correlation", [-0.1, 1.0, float("nan")]),
+    (TrainConfig, "demo_reset_ratio", [-0.1, 1.1, None]),
     (TrainConfig, "buffer_size", [0, 1e6]),
     (TrainConfig, "eval_every", [0]),
     (TrainConfig, "eval_episodes", [0]),
@@ -121,6 +125,7 @@ def test_the_table_of_bad_values_is_complete():
         lambda: BatchConfig(max_demo_ratio=0, gamma=1, reach_zero=None, num_sampled_goals=0.5),  # an int serves as a float
         lambda: AgentConfig(num_quantiles=25, top_quantiles_to_drop_per_net=24, target_entropy=-3.0, bc_weight=0, net_arch=(1,)),
         lambda: TrainConfig(algo="bc", steps=1, learning_starts=5),  # cloning takes no environment steps
+        lambda: TrainConfig(demo_reset_ratio=1, noise_correlation=0),
     ],
 )
 def test_values_at_the_edge_are_accepted(build):

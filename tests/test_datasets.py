@@ -58,6 +58,7 @@ def encoded_episodes(lengths, horizon=6, terminated=None):
         lengths=np.array(lengths, np.int32),
         terminated=np.array(terminated),
         desired_goals=desired_goals,
+        states=np.where(time[None, :, None] <= np.array(lengths)[:, None, None], states, np.nan),
     )
     return table, states
 
@@ -227,6 +228,14 @@ def test_achieved_goals_by_another_definition(path):
 
     edit(path, shift)
     assert_refused(lambda: load_demonstrations(path, LineWorld()), "demo_1", "achieved_goal is not what LineWorld derives")
+
+
+def test_what_the_environment_calls_interchangeable_may_differ(path):
+    class Flexible(LineWorld):
+        interchangeable = ("size",)
+
+    assert load_demonstrations(path, Flexible(size=5.0)).lengths.tolist() == [3, 6, 1]
+    assert_refused(lambda: load_demonstrations(path, Flexible(size=5.0, start=(0, 2))), "start = [0, 1]", "start = [0, 2]")
 
 
 # Damaged files

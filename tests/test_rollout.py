@@ -24,7 +24,7 @@ def play(key, num_steps):
     start = rollout.reset(key_reset, ENV, GOALS, 3)
 
     def step(state, key):
-        state, time_step = rollout.step(key, state, ACTIONS, ENV, GOALS)
+        state, time_step = rollout.step(state, rollout.reset(key, ENV, GOALS, 3), ACTIONS, ENV)
         return state, (state, time_step)
 
     return start, jax.lax.scan(step, start, jax.random.split(key_steps, num_steps))[1]

@@ -246,9 +246,9 @@ def test_reset_and_step_are_traced_once(data):
     reset = jax.jit(chex.assert_max_traces(rollout.reset, n=1), static_argnums=(1, 3))
     step = jax.jit(chex.assert_max_traces(rollout.step, n=1), static_argnums=3)
     state = reset(jax.random.key(0), make_env(), data.behavioural_goals, 4)
-    state = reset(jax.random.key(1), make_env(), data.behavioural_goals, 4)
-    for seed in range(3):
-        state, time_step = step(jax.random.key(seed), state, jnp.zeros((4, 2)), make_env(), data.behavioural_goals)
+    for seed in range(1, 4):
+        restarted = reset(jax.random.key(seed), make_env(), data.behavioural_goals, 4)
+        state, time_step = step(state, restarted, jnp.zeros((4, 2)), make_env())
     assert time_step.reward.shape == (4,)
 
 

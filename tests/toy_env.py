@@ -44,6 +44,10 @@ class Corridor:
         return 2
 
     @property
+    def state_dim(self) -> int:
+        return 3
+
+    @property
     def action_low(self) -> float:
         return 0.0
 
@@ -72,6 +76,12 @@ class Corridor:
     def observe(self, state: CorridorState) -> Array:
         return jnp.stack([state.start, state.step.astype(jnp.float32), state.position])
 
+    def state_to_vector(self, state: CorridorState) -> Array:
+        return jnp.stack([state.start, state.position, state.step.astype(jnp.float32)])
+
+    def vector_to_state(self, key: Array, vector: Array) -> CorridorState:
+        return CorridorState(key=key, start=vector[0], position=vector[1], step=vector[2].astype(jnp.int32))
+
     def achieved_goal(self, observation: Array) -> Array:
         """The position."""
         return observation[..., 2:]
@@ -81,18 +91,23 @@ class Corridor:
 
 
 def corridor_demonstrations(speeds=(1.0, 1.25, 0.8), *, env=None) -> Episodes:
-    """Demonstrations that walk at constant speeds until the corridor ends, with the second action dimension at 0.5 (policy units: -0.5)."""
+    """Demonstrations that walk at constant speeds until the corridor ends, with the second action dimension at 0.5 (policy units: -0.5).
+
+    Demonstration i has `start` 10 + i, which no episode of the environment's own has. Past the end, states are NaN, so that reading them shows.
+    """
     env = env or Corridor()
     num = len(speeds)
     observations = np.zeros((num, env.horizon + 1, 3), np.float32)
     actions = np.zeros((num, env.horizon, 2), np.float32)
     rewards = np.zeros((num, env.horizon), np.float32)
+    states = np.full((num, env.horizon + 1, 3), np.nan, np.float32)
     lengths = []
     for i, speed in enumerate(speeds):
         length = int(env.width // speed) + 1
         assert length <= env.horizon
         for t in range(length + 1):
             observations[i, t] = (10 + i, t, t * speed)
+            states[i, t] = (10 + i, t * speed, t)
         actions[i, :length] = (speed - 1.0, -0.5)
         rewards[i, length - 1] = 1.0
         lengths.append(length)
@@ -103,4 +118,5 @@ def corridor_demonstrations(speeds=(1.0, 1.25, 0.8), *, env=None) -> Episodes:
         lengths=jnp.asarray(lengths, jnp.int32),
         terminated=jnp.ones(num, bool),
         desired_goals=jnp.zeros((num, 1)),
+        states=jnp.asarray(states),
     )

@@ -6,32 +6,28 @@ x grows to the right and y grows downwards, as in the original's pictures: cell 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 from os import PathLike
 
-import jax
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
+from envs import drawing
 from envs.grid.pick_and_place import FixedGridPickAndPlace, GridPickAndPlace, GridState
 
-_SUPERSAMPLING = 3  # pictures are drawn this many times larger and then averaged down, for smooth edges
 _MIN_CELL = 48  # pixels
 _MIN_WIDTH = 360  # pixels, so that the caption fits beside small grids
-_MARGIN = 12  # pixels
-_CAPTION_HEIGHT = 56  # pixels
+_MARGIN = drawing.MARGIN
+_CAPTION_HEIGHT = drawing.CAPTION_HEIGHT
 
-_BACKGROUND = (255, 255, 255)
+_BACKGROUND = drawing.BACKGROUND
 _CELL = (247, 248, 250)
 _LINE = (222, 226, 232)
 _START_BOX = (255, 244, 204)
 _GOAL = (253, 222, 221)
 _GOAL_LINE = (217, 65, 65)
-_AGENT = (47, 111, 214)
-_OBJECT = (46, 158, 91)
+_AGENT = drawing.BLUE
+_OBJECT = drawing.GREEN
 _DELIVERED = (112, 188, 143)
-_INK = (38, 44, 54)
-_FAINT_INK = (110, 118, 130)
 
 
 def frame(env: GridPickAndPlace | FixedGridPickAndPlace, state: GridState, *, caption: str = "") -> np.ndarray:
@@ -51,7 +47,7 @@ def frame(env: GridPickAndPlace | FixedGridPickAndPlace, state: GridState, *, ca
     """
     cell = max(_MIN_CELL, -(-_MIN_WIDTH // env.size))
     width = env.size * cell + 2 * _MARGIN
-    canvas = _Canvas(width, width + _CAPTION_HEIGHT, cell)
+    canvas = _Canvas(width, width - _MARGIN // 2, cell)  # the caption takes the other half of the margin
     agent, goal, objects = (tuple(int(v) for v in np.ravel(a)) for a in (state.agent, state.goal, state.objects))
     objects = [objects[2 * i : 2 * i + 2] for i in range(env.num_objects)]
     held, num_delivered = int(state.held), int(state.num_delivered)
@@ -82,17 +78,14 @@ def frame(env: GridPickAndPlace | FixedGridPickAndPlace, state: GridState, *, ca
     for i in range(num_delivered):  # on top, in rows of three along the upper edge of the goal cell
         canvas.tick(objects[i], 0.15, _DELIVERED, shift=(-0.32 + 0.32 * (i % 3), -0.32 + 0.32 * (i // 3)))
 
-    below = width - _MARGIN + 6
-    canvas.text((_MARGIN, below), caption or env.name, 17, _INK, width - 2 * _MARGIN)
-    canvas.text((_MARGIN, below + 25), f"step {int(state.step)}    delivered {num_delivered}/{env.num_objects}", 15, _FAINT_INK, width // 2)
-    if bool(env.is_solved(state)):
-        canvas.text((width - _MARGIN, below + 25), "solved", 15, _OBJECT, width // 3, anchor="ra")
-    return canvas.pixels()
+    progress = f"step {int(state.step)}    delivered {num_delivered}/{env.num_objects}"
+    strip = drawing.caption_strip(width, caption or env.name, progress, solved=bool(env.is_solved(state)))
+    return np.concatenate([canvas.pixels(), strip])
 
 
 def save_png(env: GridPickAndPlace | FixedGridPickAndPlace, state: GridState, path: str | PathLike, *, caption: str = "") -> None:
     """Saves the picture that `frame` draws."""
-    Image.fromarray(frame(env, state, caption=caption)).save(path, format="PNG")
+    drawing.save_png(frame(env, state, caption=caption), path)
 
 
 def save_gif(
@@ -115,61 +108,15 @@ def save_gif(
     Raises:
       ValueError: if there are no states, or not one caption per state.
     """
-    states = _as_list(states)
-    captions = [""] * len(states) if captions is None else captions
-    if not states:
-        raise ValueError("There are no states to draw; pass at least one.")
-    if len(captions) != len(states):
-        raise ValueError(f"Pass one caption per state: got {len(captions)} captions for {len(states)} states.")
-    pictures = [frame(env, state, caption=caption) for state, caption in zip(states, captions, strict=True)]
-    images = _to_palette_images(pictures)
-    durations = [round(1000 * seconds_per_frame)] * len(images)
-    durations[-1] += 1000
-    images[0].save(path, format="GIF", save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=False)
-
-
-def _as_list(states: Sequence[GridState] | GridState) -> list[GridState]:
-    """Splits a state with a leading time axis into a list of states without keys."""
-    if not isinstance(states, GridState):
-        return list(states)
-    states = jax.tree.map(np.asarray, states.replace(key=None))
-    return [jax.tree.map(lambda a, t=t: a[t], states) for t in range(len(states.step))]
-
-
-def _to_palette_images(pictures: Sequence[np.ndarray]) -> list[Image.Image]:
-    """Reduces pictures to one common palette of their 256 most frequent colours.
-
-    All flat areas stay exact, and nothing flickers; only rare shades on the edges move to the nearest colour. (Pillow's own reduction merges
-    colours as close as our white and light grey.)
-    """
-    packed = []  # one 0xRRGGBB integer per pixel
-    for picture in pictures:
-        red, green, blue = np.moveaxis(picture.astype(np.int32), -1, 0)
-        packed.append((red << 16) | (green << 8) | blue)
-    per_picture = [np.unique(p, return_counts=True) for p in packed]
-    colours, group = np.unique(np.concatenate([c for c, _ in per_picture]), return_inverse=True)
-    frequency = np.bincount(group, np.concatenate([n for _, n in per_picture]))
-
-    rgb = np.stack([colours >> 16, (colours >> 8) & 255, colours & 255], axis=1)
-    palette = rgb[np.argsort(-frequency)[:256]]
-    nearest = np.zeros(1 << 24, np.uint8)
-    nearest[colours] = np.abs(rgb[:, None] - palette[None]).sum(axis=2).argmin(axis=1)
-    images = [Image.fromarray(nearest[p]) for p in packed]
-    for image in images:
-        image.putpalette(palette.astype(np.uint8).tobytes())
-    return images
-
-
-@lru_cache(maxsize=64)
-def _font(size: int) -> ImageFont.FreeTypeFont:
-    return ImageFont.load_default(size)
+    pictures = [frame(env, state, caption=caption) for state, caption in drawing.captioned_states(states, captions, GridState)]
+    drawing.save_gif(pictures, path, [seconds_per_frame] * len(pictures))
 
 
 class _Canvas:
     """Draws in units of cells at a larger scale and averages down at the end."""
 
     def __init__(self, width: int, height: int, cell: int):
-        self._scale = _SUPERSAMPLING
+        self._scale = drawing.SUPERSAMPLING
         self._cell = cell * self._scale
         self._origin = _MARGIN * self._scale
         self._image = Image.new("RGB", (width * self._scale, height * self._scale), _BACKGROUND)
@@ -203,20 +150,11 @@ class _Canvas:
         self.disc(cell, radius + 0.02, _BACKGROUND, shift=shift)
         self.disc(cell, radius, colour, shift=shift)
         x, y = self._centre(cell, shift)
-        r = radius * self._cell
-        points = [(x - 0.5 * r, y + 0.05 * r), (x - 0.1 * r, y + 0.45 * r), (x + 0.55 * r, y - 0.4 * r)]
-        self._draw.line(points, fill=_BACKGROUND, width=round(0.3 * r), joint="curve")
+        drawing.tick(self._draw, x, y, radius * self._cell)
 
     def label(self, cell, height: float, text: str):
         """White text in the middle of a cell; its height is in cells."""
-        self._draw.text(self._centre(cell, (0.0, 0.0)), text, font=_font(round(height * self._cell)), fill=_BACKGROUND, anchor="mm")
-
-    def text(self, position, text: str, size: int, colour, max_width: int, *, anchor: str = "la"):
-        """Position, size and width are in pixels of the final picture; text that is too wide is made smaller."""
-        pixels = size * self._scale
-        wide = _font(pixels).getlength(text)
-        pixels = max(1, int(pixels * min(1.0, max_width * self._scale / max(wide, 1.0))))
-        self._draw.text([v * self._scale for v in position], text, font=_font(pixels), fill=colour, anchor=anchor)
+        self._draw.text(self._centre(cell, (0.0, 0.0)), text, font=drawing.font(round(height * self._cell)), fill=_BACKGROUND, anchor="mm")
 
     def _corner(self, cell) -> tuple[float, float]:
         return self._origin + cell[0] * self._cell, self._origin + cell[1] * self._cell

@@ -1,0 +1,152 @@
+"""Recording demonstrations of the reach tasks by hand: a person steers robosuite's arm, shown in a window, with one of robosuite's devices."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable
+from typing import Any, get_args
+
+import jax
+import numpy as np
+
+from envs.reach import panda
+from experts.recording import Recording, on_host
+from experts.robosuite_arm import DeviceName, ReachEnvironment, RobosuiteArm, open_device, play_episode, stacked
+from hindrl_jax.errors import UserError
+from hindrl_jax.types import Array
+
+FULL_TRANSLATION, FULL_ROTATION = 0.05, 0.5  # m and rad that robosuite's default controller makes of a device's 1
+CONTROLS = {
+    "keyboard": "arrow keys: sideways, to and fro; ; and . : up and down; r e, y h, o p: turn about x, y, z; q: start over",
+    "spacemouse": "push and twist the cap to move and turn the hand; right button: start over",
+}
+
+
+class _StartOver(Exception):
+    """The person gives this episode up."""
+
+
+class _WindowClosed(Exception):
+    """The person has had enough."""
+
+
+def record_by_hand(
+    key: Array, env: ReachEnvironment, device: DeviceName, num_demos: int, *, report: Callable[[str], None] = lambda line: None
+) -> Recording:
+    """Records demonstrations that a person plays. Unsolved episodes are discarded.
+
+    An episode begins with the first movement, runs at 20 Hz, and ends when the task is solved or the horizon reached: 300 steps are 15 seconds.
+
+    Args:
+      key: random key, of starts and waypoints.
+      env: the task, with the robosuite back end.
+      device: what to steer with.
+      num_demos: N, at least 1. Closing the window ends the recording early.
+      report: called with lines for the person: the controls, and what became of each episode.
+
+    Returns:
+      N episodes, or fewer but at least one if the window was closed.
+
+    Raises:
+      UserError: if there is no screen, the device or robosuite are unusable, or nothing was recorded.
+    """
+    if num_demos < 1:
+        raise UserError(f"num_demos = {num_demos} is too few: record at least 1 demonstration")
+    if device not in get_args(DeviceName):
+        raise UserError(f"there is no device {device!r}: choose one of {', '.join(get_args(DeviceName))}")
+    if not on_host(env):
+        raise UserError(f"a person steers the arm of robosuite, not that of backend = {env.backend}: use backend = robosuite")
+    arm = RobosuiteArm(env.num_waypoints, on_screen=True)
+    with contextlib.closing(arm):
+        opened = open_device(device, arm)
+        arm.refresh()
+        report(f"{CONTROLS[device]}; close the window to stop early")
+        try:
+            return record_with(key, env, arm, opened, num_demos, report=report)
+        finally:
+            opened.listener.stop()
+
+
+def record_with(
+    key: Array,
+    env: ReachEnvironment,
+    arm: RobosuiteArm,
+    device: Any,
+    num_demos: int,
+    *,
+    report: Callable[[str], None] = lambda line: None,
+    period: float = panda.CONTROL_PERIOD,
+) -> Recording:
+    """`record_by_hand`, with an arm and a device that are open; `period` is the time between two steps in s."""
+    kept: list[Recording] = []
+    while len(kept) < num_demos:
+        key, key_episode = jax.random.split(key)
+        try:
+            episode = play_episode(key_episode, env, arm, _Hand(arm, device, period))
+        except _StartOver:
+            report("discarded: started over")
+        except _WindowClosed:
+            if not kept:
+                raise UserError("the window was closed before anything was recorded: solve at least one episode") from None
+            report(f"the window was closed after {len(kept)} of {num_demos} demonstrations")
+            break
+        else:
+            length, solved = int(episode.episodes.lengths), bool(episode.episodes.terminated)
+            if solved:
+                kept.append(episode)
+            outcome = f"demonstration {len(kept)} of {num_demos}: {length} steps" if solved else f"discarded: not solved within {length} steps"
+            report(outcome)
+    return stacked(kept)
+
+
+class _Hand:
+    """The person of one episode, as a policy that looks at the screen instead of the state."""
+
+    def __init__(self, arm: RobosuiteArm, device: Any, period: float):
+        self._arm, self._device, self._period = arm, device, period
+        self._moved, self._due = False, time.monotonic()
+        device.start_control()
+
+    def __call__(self, key: Array, state: Any, observation: Array) -> np.ndarray:
+        """Waits for the next step's turn, and at the beginning of the episode for a movement; returns the action (6,)."""
+        del key, state, observation
+        while True:
+            self._due = max(self._due + self._period, time.monotonic())  # after a delay, go on from there instead of hurrying
+            time.sleep(max(0.0, self._due - time.monotonic()))
+            if not self._arm.is_open():
+                raise _WindowClosed
+            command = command_of(self._device)
+            if command is None:
+                raise _StartOver
+            self._moved = self._moved or bool(command.any())
+            if self._moved:
+                return command
+            self._arm.refresh()
+
+
+def command_of(device: Any) -> np.ndarray | None:
+    """What a device asks for since the last call.
+
+    robosuite's devices give a displacement and roll, pitch and yaw, which it scales to [-1, 1] with each device's own gain and hands to a
+    controller that makes at most 0.05 m and 0.5 rad of them. Here they are shortened further, to what the reach tasks take.
+
+    Args:
+      device: one of robosuite's, or anything with its methods `get_controller_state` and `_postprocess_device_outputs`.
+
+    Returns:
+      (6,) displacement in m and rotation vector in rad, both in the base's axes; or None if the person wants to start over.
+    """
+    given = device.get_controller_state()
+    if given["reset"]:
+        return None
+    roll, pitch, yaw = given["raw_drotation"]
+    translation, rotation = device._postprocess_device_outputs(np.asarray(given["dpos"], float), np.array([pitch, roll, -yaw]))
+    return np.concatenate(
+        [_shortened(FULL_TRANSLATION * translation, panda.MAX_TRANSLATION), _shortened(FULL_ROTATION * rotation, panda.MAX_ROTATION)]
+    ).astype(np.float32)
+
+
+def _shortened(vector: np.ndarray, limit: float) -> np.ndarray:
+    length = np.linalg.norm(vector)
+    return vector * (limit / length) if length > limit else vector

@@ -1,0 +1,47 @@
+"""The scripted expert of the reach tasks (thesis section 4.2.2): straight to the next waypoint, with a shaky hand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from envs.reach import FixedParameterizedReach, ParameterizedReach, ReachState, panda, rotations
+from hindrl_jax.checks import check, check_types
+from hindrl_jax.types import Array
+
+
+@dataclass(frozen=True)
+class ReachExpert:
+    """Proportional control with Gaussian noise. Unbatched and pure: apply `jax.vmap` over keys and states."""
+
+    randomness_scale: float = 0.1
+    """Standard deviation of the noise on the displacement, in m, and on the rotation vector, in rad."""
+
+    def __post_init__(self):
+        check_types(self)
+        check(self, randomness_scale=(self.randomness_scale >= 0.0, "0 or more"))
+
+    def act(self, key: Array, env: FixedParameterizedReach | ParameterizedReach, state: ReachState) -> Array:
+        """Chooses an action from the state: (P_next - P) + e, e ~ N(0, randomness_scale) (thesis eq. 4.10).
+
+        Both halves are shortened to what the controller takes, 0.02 m and 0.05 rad, which it would do itself: so the action is the motion, and
+        lies within the action bounds.
+
+        Args:
+          key: random key.
+          env: the environment that `state` belongs to.
+          state: unbatched state.
+
+        Returns:
+          (6,) displacement in m and rotation vector in rad.
+        """
+        arm = panda.posture(state.joints)
+        next_one = (jnp.arange(env.num_waypoints) == jnp.minimum(state.num_reached, env.num_waypoints - 1)).astype(jnp.float32)
+        position = jnp.sum(next_one[:, None] * state.positions, axis=0)
+        rotation = jnp.sum(next_one[:, None, None] * state.rotations, axis=0)
+        noise = self.randomness_scale * jax.random.normal(key, (6,))
+        translation = panda.shortened(position - arm.hand_position + noise[:3], panda.MAX_TRANSLATION)
+        turn = panda.shortened(rotations.between(arm.hand_rotation, rotation) + noise[3:], panda.MAX_ROTATION)
+        return jnp.concatenate([translation, turn])
