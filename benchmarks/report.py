@@ -39,9 +39,13 @@ def _processor() -> str:
 
 def versions() -> dict[str, str]:
     """Versions of Python, of hindrl_jax and of what it computes with."""
-    return {"python": platform.python_version()} | {
-        name: metadata.version(name) for name in ("hindrl-jax", "jax", "jaxlib", "flax", "optax", "numpy")
-    }
+    return {"python": platform.python_version()} | installed("hindrl-jax", "jax", "jaxlib", "flax", "optax", "numpy")
+
+
+def installed(*packages: str) -> dict[str, str]:
+    """Versions of those of the packages that are installed."""
+    found = {name: next(iter(metadata.distributions(name=name)), None) for name in packages}
+    return {name: package.version for name, package in found.items() if package}
 
 
 def read(path: Path) -> Results:

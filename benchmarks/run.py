@@ -46,12 +46,14 @@ def main() -> None:
 
     import jax
 
-    from benchmarks import environments, gradient_step, relabelling, replay_size, report, seeds, startup, timing
+    from benchmarks import environments, gradient_step, reach_parity, reach_speed, relabelling, replay_size, report, seeds, startup, timing
     from benchmarks.timing import Effort, Options
 
     parts = {
         "gradient_step": gradient_step,
         "environments": environments,
+        "reach_speed": reach_speed,
+        "reach_parity": reach_parity,
         "relabelling": relabelling,
         "replay_size": replay_size,
         "seeds": seeds,
@@ -77,11 +79,13 @@ def main() -> None:
             print(f"WARNING: other programs use {busy:.0%} of the machine; timings will be off, those of PyTorch several times over", flush=True)
         began = time.perf_counter()
         rows = parts[name].run(options)
+        if not rows:  # something optional is not installed, as the part has said; what was measured earlier stays
+            continue
         measured = {
             "date": time.strftime("%Y-%m-%d"),
             "machine": report.machine(),
             "versions": report.versions(),
-            "peers": gradient_step.versions(options) if name == "gradient_step" else {},
+            "peers": parts[name].versions(options) if hasattr(parts[name], "versions") else {},
             "command": shlex.join(["python", "-m", "benchmarks.run", *sys.argv[1:]]),
             "quick": given.quick,
             "busy": busy,
@@ -89,7 +93,8 @@ def main() -> None:
         results[name] = {"measured": measured, "rows": rows}
         report.write(results, parts, json_path, markdown_path)  # after each part, so that a later failure loses nothing
         print(f"{parts[name].TITLE} took {time.perf_counter() - began:.0f} s", flush=True)
-    print(f"wrote {json_path} and {markdown_path}")
+    if json_path.exists():
+        print(f"results are in {json_path} and {markdown_path}")
 
 
 if __name__ == "__main__":

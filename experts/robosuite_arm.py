@@ -1,8 +1,8 @@
-"""The reach tasks simulated by robosuite itself: one arm on the CPU, to record demonstrations and to evaluate policies. Everything about
-robosuite is in this module.
+"""The reach tasks simulated by robosuite itself: one arm on the CPU, to record demonstrations and to evaluate policies.
 
-robosuite only moves the arm. Waypoints and start come from `env.reset`; observation, reward and progress from `env.arrive`, as with the other
-back ends. The controller is robosuite's IK_POSE at 20 Hz, with its broken default input type put right; `envs.reach.panda` restates it.
+Everything about robosuite is in this module. It only moves the arm: waypoints and start come from `env.reset`; observation, reward and progress
+from `env.arrive`, as with the other back ends. The controller is robosuite's IK_POSE at 20 Hz, with its broken default input type put right;
+`envs.reach.panda` restates it.
 
 robosuite takes seconds to import and half a gigabyte of disk, so it is optional and imported only when an arm is asked for.
 """
@@ -244,7 +244,7 @@ class RobosuiteArm:
 
         Args:
           num_waypoints: how many poses to draw.
-          on_screen: whether to show it in a window, which opens at the first step.
+          on_screen: whether to show it in a window, which `refresh` opens.
           **tolerances: position_tolerance and rotation_tolerance of the environment's own reward, which nothing here needs.
 
         Raises:
@@ -310,7 +310,7 @@ class RobosuiteArm:
         self.environment.close()
 
     def _undo_shortcuts(self) -> None:
-        """The keys that steer are shortcuts of the window as well, which would show cameras, hulls and the like."""
+        """Hides what the window has been told to show: the keys that steer are also its shortcuts for cameras, hulls and the like."""
         import mujoco
 
         window = self.environment.viewer and self.environment.viewer.viewer

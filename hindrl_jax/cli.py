@@ -32,10 +32,11 @@ from hindrl_jax.config import SWEEPABLE, TrainConfig, without_effect
 from hindrl_jax.datasets import describe_demonstrations, load_demonstrations, read_states, save_demonstrations
 from hindrl_jax.errors import UserError
 from hindrl_jax.experiment import Result, check_trainable, fit, record_demonstrations
-from hindrl_jax.goals import epsilon_from_demonstrations, goal_table
+from hindrl_jax.goals import epsilon_filter, epsilon_from_demonstrations, goal_table
+from hindrl_jax.plots import save_filter
 from hindrl_jax.presets import ORIGINAL_RULES, Preset, preset
 from hindrl_jax.registry import TASKS, checked, did_you_mean, make, task
-from hindrl_jax.runs import FROM_PYTHON, RunSpec, RunWriter, SweepWriter, draw_episode, load_run, read_spec, summarise
+from hindrl_jax.runs import FROM_PYTHON, RunSpec, RunWriter, SweepWriter, disk_trouble, draw_episode, load_run, read_spec, summarise
 from hindrl_jax.types import Episodes, RestorableEnvironment
 
 _TYRO = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
@@ -242,9 +243,10 @@ def _parse_train(arguments: list[str], options_class: type[TrainOptions] = Train
                 raise UserError(f"--{name} and --config exclude each other: the configuration file says it; drop one of them")
         spec = read_spec(Path(chosen["config"]))
     else:
-        config = preset(chosen["algo"] or "hindrl", chosen["preset"] or "default")
-        env_arguments = ORIGINAL_RULES if chosen["preset"] == "original" else {}
-        spec = RunSpec(env=make(chosen["env"] or "FixedGridPickAndPlace", **env_arguments), config=config, demos="1", seeds=(0,))
+        name = chosen["env"] or "FixedGridPickAndPlace"
+        config = preset(chosen["algo"] or "hindrl", chosen["preset"] or "default", env=name)
+        env_arguments = ORIGINAL_RULES[task(name).family] if chosen["preset"] == "original" else {}
+        spec = RunSpec(env=make(name, **env_arguments), config=config, demos="1", seeds=(0,))
 
     environment_class = type(spec.env)
     fields = [
@@ -489,13 +491,9 @@ class Info:
 def _demos_info(arguments: list[str]) -> None:
     """Say what a file of demonstrations holds."""
     options = _parse(Info, arguments, "hindrl demos info")
-    if options.m < 0 or options.k < 0:
-        raise UserError(f"--m {options.m} --k {options.k} is not usable: both must be 0 or more")
+    env, episodes, epsilon = _with_epsilon(options.file, m=options.m, k=options.k)
     summary = describe_demonstrations(options.file)
-    env = make(summary.env_name, **summary.env_kwargs)
-    episodes = load_demonstrations(options.file, env)
     achieved, lengths = env.achieved_goal(jnp.asarray(episodes.observations)), jnp.asarray(episodes.lengths)
-    epsilon = epsilon_from_demonstrations(achieved, lengths, m=options.m, k=options.k)
     filtered = goal_table(achieved, lengths, epsilon, filtered=True)
     console.print(f"{options.file}: {summary.env_name}({', '.join(f'{name}={value}' for name, value in summary.env_kwargs.items())})")
     console.print(
@@ -511,6 +509,62 @@ def _demos_info(arguments: list[str]) -> None:
     for index, row in enumerate(zip(reached.min(axis=0), reached.max(axis=0), epsilon, strict=True)):
         table.add_row(str(index), *(f"{value:.4g}" for value in row))
     console.print(table)
+
+
+@dataclasses.dataclass(frozen=True)
+class PlotDemo:
+    """Draw what the epsilon filter keeps of a demonstration."""
+
+    file: tyro.conf.Positional[Path]
+    """The HDF5 file."""
+    to: Path | None = None
+    """The .png file (default: the file's name with .png)."""
+    demo: int = 0
+    """Which demonstration, counted from 0."""
+    m: int = 5
+    """Distance in steps for epsilon (thesis eq. 4.7), over all demonstrations of the file."""
+    k: float = 0.0
+    """Weight of the standard deviation in epsilon (thesis eq. 4.7)."""
+    dims: tuple[int, int] | None = None
+    """The two goal dimensions to draw (default: those with the largest extent)."""
+
+
+def _demos_plot(arguments: list[str]) -> None:
+    """Draw what the epsilon filter keeps of a demonstration."""
+    options = _parse(PlotDemo, arguments, "hindrl demos plot")
+    path = options.to or options.file.with_suffix(".png")
+    if path.suffix != ".png":
+        raise UserError(f"cannot draw {path.name}: the name must end in .png")
+    env, episodes, epsilon = _with_epsilon(options.file, m=options.m, k=options.k)
+    if not 0 <= options.demo < len(episodes.lengths):
+        raise UserError(f"{options.file} has no demonstration {options.demo}: choose one from 0 to {len(episodes.lengths) - 1}")
+    goals = env.achieved_goal(jnp.asarray(episodes.observations[options.demo, : episodes.lengths[options.demo] + 1]))
+    dims = options.dims or tuple(sorted(int(dim) for dim in np.argsort(-np.ptp(_continuous(goals), axis=0), kind="stable")[:2]))
+    if len(set(dims)) < 2 or not all(0 <= dim < env.goal_dim for dim in dims):
+        raise UserError(f"--dims {dims[0]} {dims[1]} is not usable: give two different numbers from 0 to {env.goal_dim - 1}")
+    kept = np.asarray(epsilon_filter(goals, epsilon))
+    title = f"{env.name}, demonstration {options.demo}, m = {options.m}, k = {options.k:g}"
+    with disk_trouble(path):
+        save_filter(np.asarray(goals), kept, np.asarray(epsilon), path, dims=dims, title=title)
+    console.print(f"wrote {path}: the filter keeps {kept.sum()} of {len(kept)} goals")
+
+
+def _continuous(goals: Any) -> np.ndarray:
+    """The goals (T, G) without what only jumps between whole numbers, such as masks, unless there is nothing else."""
+    goals = np.asarray(goals)
+    whole = (goals == np.round(goals)).all(axis=0)
+    return goals if whole.all() else np.where(whole[None], 0.0, goals)
+
+
+def _with_epsilon(file: Path, *, m: int, k: float) -> tuple[RestorableEnvironment, Episodes, jax.Array]:
+    """The demonstrations of a file, their environment, and epsilon over all of them."""
+    if m < 0 or k < 0:
+        raise UserError(f"--m {m} --k {k} is not usable: both must be 0 or more")
+    summary = describe_demonstrations(file)
+    env = make(summary.env_name, **summary.env_kwargs)
+    episodes = load_demonstrations(file, env)
+    achieved = env.achieved_goal(jnp.asarray(episodes.observations))
+    return env, episodes, epsilon_from_demonstrations(achieved, jnp.asarray(episodes.lengths), m=m, k=k)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -559,7 +613,7 @@ COMMANDS: dict[str, Command | dict[str, Command]] = {
     "sweep": _sweep,
     "eval": _eval,
     "render": _render,
-    "demos": {"record": _demos_record, "info": _demos_info, "render": _demos_render},
+    "demos": {"record": _demos_record, "info": _demos_info, "plot": _demos_plot, "render": _demos_render},
     "envs": _envs,
 }
 

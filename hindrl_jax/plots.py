@@ -52,6 +52,37 @@ def save_sweep(parts: Sequence[Result], labels: Sequence[str], path: Path) -> No
     plt.close(figure)
 
 
+def save_filter(achieved_goals: np.ndarray, kept: np.ndarray, epsilon: np.ndarray, path: Path, *, dims: tuple[int, int], title: str) -> None:
+    """Draws what the epsilon filter does to one demonstration, as in thesis figures 4.1 and 4.2, as a PNG.
+
+    On the left all goals that it reached, on the right those that are kept, with their boxes of half-width epsilon.
+
+    Args:
+      achieved_goals: (L + 1, G) goals along the demonstration.
+      kept: (L + 1,) bool, see `goals.epsilon_filter`.
+      epsilon: (G,) half-width of the goal box.
+      path: the file.
+      dims: the two goal dimensions to draw.
+      title: what the demonstration is.
+    """
+    plt = _pyplot()
+    x, y = (achieved_goals[:, dim] for dim in dims)
+    figure, axes = plt.subplots(1, 2, figsize=(10, 4.8), sharex=True, sharey=True, layout="constrained")
+    for axis, shown, label in ((axes[0], np.ones_like(kept), "all goals reached"), (axes[1], kept, "kept by the filter")):
+        axis.plot(x, y, color="0.75", linewidth=1, linestyle="--", zorder=1)
+        axis.scatter(x[shown], y[shown], s=14, c=np.flatnonzero(shown), cmap="viridis", zorder=3)
+        axis.set_title(f"{label}: {shown.sum()}", loc="left")
+        axis.set(xlabel=f"goal dimension {dims[0]}", ylabel=f"goal dimension {dims[1]}")
+        axis.grid(alpha=0.25)
+        axis.spines[["top", "right"]].set_visible(False)
+    width, height = 2 * epsilon[list(dims)]
+    for left, bottom in zip(x[kept] - width / 2, y[kept] - height / 2, strict=True):
+        axes[1].add_patch(plt.Rectangle((left, bottom), width, height, facecolor=_SEED, edgecolor=_MEAN, alpha=0.25, linewidth=0.5, zorder=2))
+    figure.suptitle(title, x=0.01, ha="left")
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
 def _pyplot() -> Any:
     import matplotlib
 

@@ -3,29 +3,32 @@
 default    the project's own recipe, for a laptop CPU
 thesis     the hyperparameters of the thesis's appendix, on plain correct code
 original   the same, with the quirks of the original implementation that explain its published figures
+
+Each has one column for the grid worlds and one for the reach tasks, as the thesis's appendix does.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from hindrl_jax.config import AgentConfig, Algorithm, BatchConfig, GoalConfig, TrainConfig
 from hindrl_jax.errors import UserError
-from hindrl_jax.registry import did_you_mean
+from hindrl_jax.registry import Family, did_you_mean, task
 
 Preset = Literal["default", "thesis", "original"]
 
-ORIGINAL_RULES = {"strict_order": False}
-"""Arguments of the grid environments under which the original code ran: its rules let the last object win alone."""
+ORIGINAL_RULES: dict[str, dict[str, Any]] = {"grid": {"strict_order": False}, "reach": {"orientation": "axis_angle"}}
+"""Per family of environments, the arguments under which the original code ran: the last object wins alone, orientations jump."""
 
 
-def preset(algo: Algorithm = "hindrl", name: Preset = "default") -> TrainConfig:
+def preset(algo: Algorithm = "hindrl", name: Preset = "default", *, env: str = "FixedGridPickAndPlace") -> TrainConfig:
     """The config of a model.
 
     Args:
       algo: "bc", "tqcfd", "hindrl" or "smooth-hindrl".
       name: "default", "thesis" or "original", see the module's docstring.
+      env: name of the environment that it is for.
 
     Raises:
       UserError: for a name that does not exist.
@@ -33,7 +36,8 @@ def preset(algo: Algorithm = "hindrl", name: Preset = "default") -> TrainConfig:
     for value, kind, known in ((algo, "algorithm", get_args(Algorithm)), (name, "preset", get_args(Preset))):
         if value not in known:
             raise UserError(f"unknown {kind} {value!r}{did_you_mean(value, known)}; choose one of {', '.join(known)}")
-    return {"default": _default, "thesis": _thesis, "original": _original}[name](algo)
+    config = {"default": _default, "thesis": _thesis, "original": _original}[name](algo, task(env).family)
+    return config if algo == "bc" else _as_algorithm(config, algo)
 
 
 def _as_algorithm(config: TrainConfig, algo: Algorithm) -> TrainConfig:
@@ -46,72 +50,101 @@ def _as_algorithm(config: TrainConfig, algo: Algorithm) -> TrainConfig:
     return dataclasses.replace(config, algo=algo, batch=batch, goal=goal)
 
 
-def _default(algo: Algorithm) -> TrainConfig:
+def _default(algo: Algorithm, family: Family) -> TrainConfig:
+    """The project's own recipe; for the grid that is what `TrainConfig()` says."""
+    encoding = "standardised" if family == "reach" else "multiscale"
     if algo == "bc":
         return TrainConfig(
             algo="bc",
             steps=4_000,
             eval_every=1_000,
             batch=BatchConfig(n_step=1),
-            agent=AgentConfig(net_arch=(64, 64)),
+            agent=AgentConfig(net_arch=(64, 64), input_encoding=encoding),
         )
-    return _as_algorithm(TrainConfig(), algo)
+    if family == "grid":
+        return TrainConfig()
+    return TrainConfig(
+        steps=48_000,
+        num_envs=16,
+        updates_per_iteration=16,
+        learning_starts=4_800,
+        demo_reset_ratio=0.75,
+        eval_every=4_000,
+        eval_episodes=20,
+        batch=BatchConfig(n_step=10, gamma=0.99, bound_by_obtained_return=True),
+        goal=GoalConfig(m=5, k=0.0),
+        agent=AgentConfig(
+            layer_norm=True,
+            final_learning_rate=3e-5,
+            clip_targets=True,
+            target_update_rate=0.01,
+            actor_average_rate=0.0005,
+            bc_weight=0.03,
+            input_encoding=encoding,
+        ),
+    )
 
 
-def _thesis(algo: Algorithm) -> TrainConfig:
-    """Appendix A.1.1, with what the text leaves to its framework: gamma 0.99, target rate 0.005, one environment, one update per step."""
+_FRAMEWORK = dict(input_encoding="raw", actor_average_rate=1.0, policy_input="achieved_desired_observation")
+"""How the networks of the thesis's framework are fed and evaluated."""
+
+
+def _thesis(algo: Algorithm, family: Family) -> TrainConfig:
+    """Appendices A.1.1 and A.1.2, with what the text leaves to its framework: gamma 0.99, target rate 0.005, one environment, one update per step."""
     if algo == "bc":
         return TrainConfig(
             algo="bc",
             steps=20_000,
             eval_every=1_000,
             batch=BatchConfig(batch_size=2_048, n_step=1),
-            agent=AgentConfig(
-                net_arch=(32, 32), learning_rate=1e-3, input_encoding="raw", actor_average_rate=1.0, policy_input="achieved_desired_observation"
-            ),
+            agent=AgentConfig(net_arch=(32, 32), learning_rate=1e-3, **_FRAMEWORK),
         )
-    config = TrainConfig(
+    reach = family == "reach"
+    return TrainConfig(
         steps=300_000,
         num_envs=1,
         updates_per_iteration=1,
-        learning_starts=10_000,
-        buffer_size=500_000,
+        learning_starts=5_000 if reach else 10_000,
+        buffer_size=1_000_000 if reach else 500_000,
         eval_every=5_000,
         batch=BatchConfig(
-            batch_size=4_096,
+            batch_size=12_000 if reach else 4_096,
             max_demo_ratio=0.1,
-            reach_zero=500_000,
+            reach_zero=1_000_000 if reach else 500_000,
             num_sampled_goals=4.0,
             hindrl_sampling_strategy="task_conditioned",
             n_step=1,
             gamma=0.99,
             terminate_on_relabel=False,
         ),
-        goal=GoalConfig(m=0, k=0.0),
+        goal=GoalConfig(m=5 if reach else 0, k=0.0),
         agent=AgentConfig(
-            net_arch=(64, 64, 64, 64),
+            net_arch=8 * (32,) if reach else 4 * (64,),
             layer_norm=False,
             learning_rate=1e-3,
             final_learning_rate=None,
-            top_quantiles_to_drop_per_net=2,
+            top_quantiles_to_drop_per_net=8 if reach else 2,
             target_update_rate=0.005,
             initial_alpha=1.0,
             target_entropy=None,
             final_target_entropy=None,
-            bc_weight=1.0,
-            input_encoding="raw",
-            actor_average_rate=1.0,
-            policy_input="achieved_desired_observation",
+            bc_weight=0.0 if reach else 1.0,
+            **_FRAMEWORK,
         ),
     )
-    return _as_algorithm(config, algo)
 
 
-def _original(algo: Algorithm) -> TrainConfig:
-    config = _thesis(algo)
+def _original(algo: Algorithm, family: Family) -> TrainConfig:
+    config = _thesis(algo, family)
     return dataclasses.replace(
         config,
         batch=dataclasses.replace(config.batch, inclusive_goal_test=False, timeouts_are_terminal=True),
-        goal=dataclasses.replace(config.goal, behavioural_goals="task", exclude_last_goal=True, rescale_demo_actions=False),
+        goal=dataclasses.replace(
+            config.goal,
+            behavioural_goals="task",
+            exclude_last_goal=True,
+            rescale_demo_actions=False,
+            misalign_demo_actions=family == "reach",
+        ),
         agent=dataclasses.replace(config.agent, bc_loss="norm", bc_action="sample"),
     )

@@ -7,7 +7,7 @@ import difflib
 import importlib
 from collections.abc import Callable
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal
 
 from envs.grid import FixedGridPickAndPlace, GridPickAndPlace
 from envs.reach import FixedParameterizedReach, ParameterizedReach
@@ -15,6 +15,8 @@ from experts.grid import GridExpert
 from experts.reach import ReachExpert
 from hindrl_jax.errors import UserError
 from hindrl_jax.types import RestorableEnvironment
+
+Family = Literal["grid", "reach"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,6 +29,8 @@ class Task:
     """Frozen dataclass with a method act(key, env, state)."""
     viewer_module: str
     """Module with save_png(env, state, path) and save_gif(env, states, path); imported only to draw."""
+    family: Family
+    """Which of the presets' recipes is for it."""
     summary: str
     """One line for the table of `hindrl envs`."""
 
@@ -34,10 +38,10 @@ class Task:
 TASKS: dict[str, Task] = {
     task.environment.name: task
     for task in (
-        Task(GridPickAndPlace, GridExpert, "envs.grid.viewer", "objects, agent and goal anywhere on the grid (thesis 3.1.1)"),
-        Task(FixedGridPickAndPlace, GridExpert, "envs.grid.viewer", "each of them within a small box of its own (thesis 3.1.2)"),
-        Task(ParameterizedReach, ReachExpert, "envs.reach.viewer", "a Panda arm reaches random poses in order (thesis 3.2.1)"),
-        Task(FixedParameterizedReach, ReachExpert, "envs.reach.viewer", "the same, with poses that never change (thesis 3.2.2)"),
+        Task(GridPickAndPlace, GridExpert, "envs.grid.viewer", "grid", "objects, agent and goal anywhere on the grid (thesis 3.1.1)"),
+        Task(FixedGridPickAndPlace, GridExpert, "envs.grid.viewer", "grid", "each of them within a small box of its own (thesis 3.1.2)"),
+        Task(ParameterizedReach, ReachExpert, "envs.reach.viewer", "reach", "a Panda arm reaches random poses in order (thesis 3.2.1)"),
+        Task(FixedParameterizedReach, ReachExpert, "envs.reach.viewer", "reach", "the same, with poses that never change (thesis 3.2.2)"),
     )
 }
 

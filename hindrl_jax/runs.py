@@ -160,7 +160,7 @@ class RunWriter:
         Raises:
           UserError: if the directory cannot be written.
         """
-        with _disk_trouble(self.path):
+        with disk_trouble(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
             for name in _FILES:
                 (self.path / name).unlink(missing_ok=True)
@@ -173,7 +173,7 @@ class RunWriter:
         if not rows:
             return
         fields = [*_ROW_FIELDS, *rows[0].metrics]
-        with _disk_trouble(self.path), (self.path / METRICS).open("a", newline="") as file:
+        with disk_trouble(self.path), (self.path / METRICS).open("a", newline="") as file:
             writer = csv.DictWriter(file, fields)
             if self.rows_written == 0:
                 writer.writeheader()
@@ -186,7 +186,7 @@ class RunWriter:
         """Writes the parameters, the summary, the curve and (unless `film` is off) the film of an episode; returns the summary."""
         self.report(result.rows)
         summary = summarise(result)
-        with _disk_trouble(self.path):
+        with disk_trouble(self.path):
             _save_parameters(self.path / PARAMETERS, result)
             _write_atomically(self.path / SUMMARY, json.dumps(summary, indent=2) + "\n")
             plots.save_curve(result, self.path / CURVE)
@@ -236,7 +236,7 @@ class SweepWriter:
                 "worst_final_success": min(final),
             }
             table.append(setting | outcome)
-        with _disk_trouble(self.path):
+        with disk_trouble(self.path):
             with (self.path / SWEEP).open("w", newline="") as file:
                 writer = csv.DictWriter(file, list(table[0]))
                 writer.writeheader()
@@ -408,7 +408,7 @@ def draw_episode(path: Path, env: RestorableEnvironment, states: np.ndarray) -> 
         raise UserError(f"states of {states.shape[-1]} numbers are not those of {env.name}, which has {env.state_dim}: record them again")
     key = jax.random.key(0)
     unpacked = [env.vector_to_state(key, jnp.asarray(state)) for state in states]
-    with _disk_trouble(path):
+    with disk_trouble(path):
         if path.suffix == ".gif":
             viewer(env).save_gif(env, unpacked, path)
         else:
@@ -423,7 +423,7 @@ def _check_drawable(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def _disk_trouble(path: Path) -> Iterator[None]:
+def disk_trouble(path: Path) -> Iterator[None]:
     """Turns what the disk refuses into one line for the user."""
     try:
         yield

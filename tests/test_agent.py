@@ -228,7 +228,7 @@ def test_target_critics_and_average_actor_move_by_their_rates():
     assert max(np.abs(a - b).max() for a, b in zip(*map(jax.tree.leaves, (before.critics, after.critics)), strict=True)) > 1e-3
 
 
-# Observation (1, 2) over (2, 4) is (1/2, 1/2); achieved goal 3 over 6 is 1/2, too, and desired goal 0 is 0.
+# Observation (1, 2) less (0, 4) over (2, 4) is (1/2, -1/2); achieved goal 3 less 0 over 6 is 1/2, too, and desired goal 0 is 0.
 HALF = [0.5, np.tanh(2.0)]
 
 
@@ -237,12 +237,16 @@ HALF = [0.5, np.tanh(2.0)]
     [
         ("raw", "observation_goal", [1.0, 2.0, 0.0]),
         ("raw", "achieved_desired_observation", [3.0, 0.0, 1.0, 2.0]),
-        ("multiscale", "observation_goal", [0.5, 0.5, HALF[1], HALF[1], 0.0, 0.0]),
-        ("multiscale", "achieved_desired_observation", [*HALF, 0.0, 0.0, 0.5, 0.5, HALF[1], HALF[1]]),
+        ("multiscale", "observation_goal", [0.5, -0.5, HALF[1], -HALF[1], 0.0, 0.0]),
+        ("multiscale", "achieved_desired_observation", [*HALF, 0.0, 0.0, 0.5, -0.5, HALF[1], -HALF[1]]),
+        ("standardised", "observation_goal", [0.5, -0.5, 0.0]),
+        ("standardised", "achieved_desired_observation", [0.5, 0.0, 0.5, -0.5]),
     ],
 )
 def test_network_inputs_by_hand(encoding, form, expected):
-    scale = agents.InputScale(observation=jnp.array([2.0, 4.0]), goal=jnp.array([6.0]))
+    scale = agents.InputScale(
+        observation=jnp.array([2.0, 4.0]), goal=jnp.array([6.0]), observation_centre=jnp.array([0.0, 4.0]), goal_centre=jnp.zeros(1)
+    )
     config = AgentConfig(policy_input=form, input_encoding=encoding, net_arch=(3,))
     parts = (jnp.array([[1.0, 2.0]]), jnp.array([[3.0]]), jnp.array([[0.0]]))
     np.testing.assert_allclose(agents.network_inputs(*parts, scale, config), [expected], rtol=1e-6)
@@ -253,12 +257,78 @@ def test_network_inputs_by_hand(encoding, form, expected):
 
 
 @pytest.mark.parametrize("padding", [7.0, np.nan])
-def test_input_scale_by_hand(padding):
-    # Three states count: (3, 0), (4, 0) and (5, 0); root mean squares sqrt(50 / 3) and, always zero, 1.
-    observations = jnp.array([[[3.0, 0.0], [4.0, 0.0]], [[5.0, 0.0], [padding, padding]]])
-    scale = agents.input_scale(observations, observations[..., :1], jnp.array([[True, True], [True, False]]))
-    np.testing.assert_allclose(scale.observation, [(50 / 3) ** 0.5, 1.0], rtol=1e-6)
-    np.testing.assert_allclose(scale.goal, [(50 / 3) ** 0.5], rtol=1e-6)
+@pytest.mark.parametrize(
+    ("encoding", "centre", "size"),
+    [
+        # Three states count: (3, 0, 2), (4, 0, 2) and (5, 0, 2); root mean squares sqrt(50 / 3), 2 and, always zero, 1.
+        ("multiscale", [0.0, 0.0, 0.0], [(50 / 3) ** 0.5, 1.0, 2.0]),
+        # Means 4, 0 and 2, standard deviations sqrt(2 / 3) and, always equal, 1.
+        ("standardised", [4.0, 0.0, 2.0], [(2 / 3) ** 0.5, 1.0, 1.0]),
+    ],
+)
+def test_input_scale_by_hand(encoding, centre, size, padding):
+    observations = jnp.array([[[3.0, 0.0, 2.0], [4.0, 0.0, 2.0]], [[5.0, 0.0, 2.0], [padding, padding, padding]]])
+    config = AgentConfig(input_encoding=encoding)
+    scale = agents.input_scale(observations, observations[..., :1], jnp.array([[True, True], [True, False]]), config)
+    np.testing.assert_allclose(scale.observation, size, rtol=1e-6)
+    np.testing.assert_allclose(scale.observation_centre, centre, rtol=1e-6)
+    np.testing.assert_allclose([scale.goal, scale.goal_centre], [size[:1], centre[:1]], rtol=1e-6)
+
+
+def test_standardised_inputs_have_mean_0_and_deviation_1_over_what_was_visited():
+    rng = np.random.default_rng(0)
+    observations = rng.normal([0.4, -20.0, 1e-3], [1e-3, 5.0, 1e-5], (4, 30, 3)).astype(np.float32)
+    observations = np.concatenate([observations, np.full((4, 30, 1), 0.1, np.float32)], axis=2)  # and one dimension that never changes
+    visited = np.arange(30)[None] < np.array([[30], [7], [12], [1]])
+    padded = jnp.asarray(np.where(visited[..., None], observations, np.nan))
+    config = AgentConfig(input_encoding="standardised")
+    scale = agents.input_scale(padded, padded[..., :2], jnp.asarray(visited), config)
+    seen = jnp.asarray(observations[visited])
+    inputs = np.asarray(agents.network_inputs(seen, seen[:, :2], seen[:, :2], scale, config))
+    np.testing.assert_allclose(inputs.mean(axis=0), 0.0, atol=1e-3)
+    np.testing.assert_allclose(inputs[:, [0, 1, 2, 4, 5]].std(axis=0), 1.0, rtol=1e-3)
+    np.testing.assert_allclose(inputs[:, 3], 0.0, atol=1e-6)
+    # Elsewhere, that dimension counts by its difference.
+    elsewhere = agents.network_inputs(seen[0] + 0.5, seen[0, :2], seen[0, :2], scale, config)
+    np.testing.assert_allclose(elsewhere[3], 0.5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("clip", "obtained", "expected"),
+    # Targets are 0.4 + 0.5 (-1, 0, 1, 2) = (-0.1, 0.4, 0.9, 1.4), with a mean of 0.65, in every row. Half of the rows went on to obtain 0.5.
+    [
+        (True, None, (0.0 + 0.4 + 0.9 + 1.0) / 4),
+        (False, [0.0, 0.5], ((0.0 + 0.4 + 0.9 + 1.4) / 4 + (0.5 + 0.5 + 0.9 + 1.4) / 4) / 2),
+        (True, [0.0, 0.5], ((0.0 + 0.4 + 0.9 + 1.0) / 4 + (0.5 + 0.5 + 0.9 + 1.0) / 4) / 2),
+        (True, [1.0, 1.0], 1.0),  # the return of a solved task is what is left of it
+    ],
+)
+def test_bounds_of_the_targets_by_hand(clip, obtained, expected):
+    start = fresh_agent(jax.random.key(8)).replace(log_alpha=jnp.asarray(-30.0))
+    last_layer = start.target_critics["params"]["Dense_1"]
+    last_layer = {"kernel": jnp.zeros_like(last_layer["kernel"]), "bias": jnp.tile(jnp.array([-1.0, 0.0, 1.0, 2.0]), (2, 1))}
+    start = start.replace(target_critics={"params": {**start.target_critics["params"], "Dense_1": last_layer}})
+    batch = make_batch(action=ACTIONS, reward=0.4, discount=0.5)
+    batch = batch.replace(obtained_return=None if obtained is None else jnp.tile(jnp.array(obtained), B // 2))
+    config = dataclasses.replace(CONFIG, clip_targets=clip)
+    inputs = inputs_of(batch.observation, config)
+
+    @jax.jit
+    def target(key):
+        return agents.update(key, start, batch, inputs=inputs, next_inputs=inputs, schedule=SCHEDULE, config=config)[1]["critic/target"]
+
+    np.testing.assert_allclose(target(jax.random.key(0)), expected, atol=1e-5)
+
+
+def test_actions_by_hand():
+    shapes = jax.eval_shape(lambda key: agents.init(key, CONFIG, observation_dim=2, goal_dim=1, action_dim=2), jax.random.key(0)).actor
+    actor = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes)
+    actor["params"]["Dense_1"]["bias"] = jnp.array([0.5, -1.0, np.log(0.1), np.log(2.0)])  # means, and logarithms of the deviations
+    select = functools.partial(agents.select_action, actor, jnp.ones((3, 3)), CONFIG, action_dim=2)
+    # Mean plus deviation times noise: (0.5 + 0.1 n, -1 + 2 n').
+    sampled = select(noise=jnp.array([[0.0, 0.0], [1.0, -1.0], [-2.0, 0.5]]))
+    np.testing.assert_allclose(sampled, np.tanh([[0.5, -1.0], [0.6, -3.0], [0.3, 0.0]]), atol=1e-6)
+    np.testing.assert_allclose(select(), np.tanh([[0.5, -1.0]] * 3), atol=1e-6)
 
 
 def test_initial_alpha():

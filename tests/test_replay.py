@@ -189,7 +189,7 @@ def expected_return(state, length, goal, *, relabelled, config):
     return total, discount, following
 
 
-BATCH = BatchConfig(batch_size=64, max_demo_ratio=0.2, num_sampled_goals=3, gamma=0.5, n_step=2)
+BATCH = BatchConfig(batch_size=64, max_demo_ratio=0.2, num_sampled_goals=3, gamma=0.5, n_step=2, bound_by_obtained_return=True)
 NUM_DEMO, NUM_RELABELLED = 12, 39  # int(0.2 * 64), (64 - 12) * 3 // 4
 STRATEGIES = ("final", "future", "episode", "task_conditioned", "joint_union")
 
@@ -228,6 +228,7 @@ def test_every_row_of_a_batch_comes_from_where_it_should(strategy):
             assert goal in (allowed_goals(strategy, state, length) if relabelled else {(-1 - env, episode, 0)})
             reward, discount, following = expected_return(state, length, goal, relabelled=relabelled, config=config)
             assert (batch.reward[row], batch.discount[row]) == (reward, discount)  # exact, since gamma = 1/2
+            assert batch.obtained_return[row] == (0.0 if relabelled else reward_of(env, episode, length - 1) * 0.5 ** (length - 1 - t))
             assert nexts[row] == following
             assert batch.action[row, 0] == reward_of(env, episode, t)
 
@@ -345,6 +346,7 @@ ROWS = 6
         inclusive_goal_test=st.booleans(),
         terminate_on_relabel=st.booleans(),
         timeouts_are_terminal=st.booleans(),
+        bound_by_obtained_return=st.booleans(),
     ),
     is_demonstration=st.booleans(),
 )
@@ -387,6 +389,11 @@ def test_transitions_are_those_of_a_plain_loop(lengths, places, terminated, chos
         np.testing.assert_array_equal(batch.next_observation[i], following)
         np.testing.assert_array_equal(batch.observation[i], observations[rows[i], steps[i]])
         assert batch.action[i, 0] == -rewards[rows[i], steps[i]]
+        if config.bound_by_obtained_return:
+            last = lengths[rows[i]] - 1
+            obtained = 0.0 if relabelled[i] else rewards[rows[i], last] * config.gamma ** (last - steps[i])
+            np.testing.assert_allclose(batch.obtained_return[i], obtained, rtol=1e-5)
+    assert (batch.obtained_return is None) == (not config.bound_by_obtained_return)
     assert np.asarray(batch.is_demonstration).tolist() == [is_demonstration] * ROWS
 
 
@@ -405,10 +412,11 @@ def test_last_row_of_a_solved_demonstration_is_worth_one_and_ends():
         relabelled=jnp.zeros(6, bool),
         epsilon=jnp.zeros(3),
         is_demonstration=True,
-        config=BatchConfig(n_step=1, gamma=0.5),
+        config=BatchConfig(n_step=1, gamma=0.5, bound_by_obtained_return=True),
     )
     assert batch.reward.tolist() == [0, 0, 1, 1, 0, 1]
     assert batch.discount.tolist() == [0.5, 0.5, 0, 0, 0.5, 0]
+    assert batch.obtained_return.tolist() == [0.25, 0.5, 1, 1, 0.5, 1]  # lengths 3, 1 and 2
 
 
 def test_capacity_is_at_least_two_episodes_per_environment():

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toy_env import Corridor
+from toy_env import Corridor, corridor_demonstrations
 
 from hindrl_jax import rollout
 from hindrl_jax.goals import GoalTable
@@ -70,6 +70,56 @@ def test_goal_is_kept_within_an_episode_and_drawn_anew_after_it(played):
     over = np.asarray(time_steps.terminated | time_steps.truncated)
     np.testing.assert_array_equal(np.asarray(states.desired_goal)[~over], before[~over])
     assert set(np.asarray(states.desired_goal)[over][:, 0].tolist()) == {7.0, 8.0, 9.0}
+
+
+def test_start_table_by_hand():
+    # State (episode, t); the episodes have 2, 3 and 1 transitions, and what lies behind their last states is never read.
+    states = np.full((3, 4, 2), np.nan, np.float32)
+    for episode, length in enumerate((2, 3, 1)):
+        states[episode, : length + 1] = [(episode, t) for t in range(length + 1)]
+    table = rollout.start_table(jnp.asarray(states), jnp.array([2, 3, 1]))
+    assert int(table.count) == 6
+    assert table.states[:6].tolist() == [[0, 0], [0, 1], [1, 0], [1, 1], [1, 2], [2, 0]]
+
+
+DEMONSTRATIONS = corridor_demonstrations((1.0, 0.7), env=ENV)  # 4 and 5 steps, starts 10 and 11; padding is NaN
+
+
+@functools.partial(jax.jit, static_argnames="ratio")
+def starts(key, ratio):
+    table = rollout.start_table(DEMONSTRATIONS.states, DEMONSTRATIONS.lengths)
+    return rollout.reset(key, ENV, GOALS, 3000, starts=table, demo_reset_ratio=ratio)
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.3, 1.0])
+def test_the_given_share_of_episodes_begins_in_demonstrated_states(ratio):
+    state = jax.device_get(starts(jax.random.key(0), ratio).replace(env_state=None))
+    demonstrated = state.observation[:, 0] >= 10
+    assert abs(demonstrated.sum() - 3000 * ratio) <= 5 * np.sqrt(3000 * ratio * (1 - ratio))
+    assert np.all(state.observation[~demonstrated][:, 1:] == 0.0)  # the environment's own start
+    assert len(np.unique(state.observation[~demonstrated][:, 0])) == (~demonstrated).sum()
+    assert set(state.desired_goal[:, 0].tolist()) == {7.0, 8.0, 9.0}  # goals are drawn as ever
+    if ratio == 0.0:
+        return
+    # Each of the 4 + 5 states but the last ones, as often as any other.
+    rows, counts = np.unique(state.observation[demonstrated], axis=0, return_counts=True)
+    expected = np.concatenate([DEMONSTRATIONS.observations[i, :length] for i, length in enumerate((4, 5))])
+    np.testing.assert_array_equal(rows, expected)
+    assert np.abs(counts - demonstrated.sum() / 9).max() < 5 * np.sqrt(demonstrated.sum() / 9)
+
+
+def test_a_demonstrated_start_is_the_whole_state_with_keys_of_its_own():
+    state = starts(jax.random.key(1), 1.0)
+    np.testing.assert_array_equal(state.observation, jax.vmap(ENV.observe)(state.env_state))
+    keys = jax.random.key_data(state.env_state.key)
+    assert len(np.unique(keys, axis=0)) == len(keys)
+    # It goes on as the demonstration did, and has the steps left that the demonstration had: at velocity 1, 4 passes the width of 3.
+    first = np.flatnonzero((state.observation[:, 0] == 10) & (state.observation[:, 1] == 2))[:1]
+    env_state = jax.tree.map(lambda leaf: leaf[first[0]], state.env_state)
+    for t in (3, 4):
+        env_state, time_step = ENV.step(env_state, jnp.ones(2))
+        assert time_step.observation.tolist() == [10.0, t, t]
+        assert bool(time_step.terminated) == (t == 4)
 
 
 @functools.partial(jax.jit, static_argnames=("act", "num_episodes"))

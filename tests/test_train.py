@@ -14,6 +14,7 @@ from toy_env import FAST_COMPILATION, Corridor, corridor_demonstrations
 from envs.grid import FixedGridPickAndPlace
 from hindrl_jax import rollout, train
 from hindrl_jax.config import AgentConfig, BatchConfig, GoalConfig, TrainConfig
+from hindrl_jax.errors import UserError
 from hindrl_jax.types import Episodes
 
 NUM_ENVS, HORIZON, COLLECT_STEPS, LEARN_STEPS = 3, 7, 14, 3
@@ -163,6 +164,39 @@ def test_actions_are_uniform_at_first_and_the_policys_when_learning(learnt):
     assert len(first_of_policy) == NUM_ENVS  # sampled: the mean action is the same in all environments
 
 
+@pytest.mark.parametrize("correlation", [0.0, 0.8])
+def test_exploration_noise_is_correlated_from_step_to_step_and_standard_normal(correlation, data):
+    config, env = make_config(num_envs=400, noise_correlation=correlation, buffer_size=10**6), make_env()
+
+    @functools.partial(jax.jit, compiler_options=FAST_COMPILATION)
+    def run(key):
+        def step(state, _):
+            state = train.collect(state, data, env=env, config=config, num_iterations=1)
+            return state, state.exploration
+
+        return jax.lax.scan(step, train.init(key, data, env, config), length=40)
+
+    state, noise = jax.device_get(run(jax.random.key(0)))
+    noise = noise[30:].astype(float)  # (10, 400, 2), long after the start at 0
+    assert noise.shape == (10, 400, 2)
+    # 4,000 numbers in each dimension; neighbours share their information, so the deviations are up to 3 times 1 / sqrt(4000).
+    np.testing.assert_allclose(noise.mean(axis=(0, 1)), 0.0, atol=0.2)
+    np.testing.assert_allclose(noise.var(axis=(0, 1)), 1.0, atol=0.2)
+    for lag in (1, 2):
+        np.testing.assert_allclose((noise[lag:] * noise[:-lag]).mean(axis=(0, 1)), correlation**lag, atol=0.15)
+    assert abs((noise[..., 0] * noise[..., 1]).mean()) < 0.15  # dimensions and environments do not depend on each other
+    assert abs((noise[:, :200] * noise[:, 200:]).mean()) < 0.15
+    # The stored actions are made of it, and uniform.
+    replay = state.replay
+    slots = replay.episodes.lengths.shape[0] // 400
+    rows = np.arange(400) * slots + replay.slot
+    under_way = replay.step > 0
+    latest = replay.episodes.actions[rows, replay.step - 1][under_way]
+    np.testing.assert_allclose(latest, 2.0 * jax.scipy.stats.norm.cdf(noise[-1][under_way]) - 1.0, atol=1e-5)
+    assert latest.std() == pytest.approx(3**-0.5, abs=0.05)
+    assert np.abs(latest).max() < 1.0
+
+
 def stack(*trees):
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
 
@@ -278,8 +312,10 @@ def test_guidance_by_default():
     assert demonstrations.desired_goals.tolist() == [[4.0], [4.0]]
     given = corridor_demonstrations(TWO_SPEEDS)
     for field in dataclasses.fields(Episodes):
-        if field.name != "desired_goals":
+        if field.name not in ("desired_goals", "states"):
             np.testing.assert_array_equal(getattr(demonstrations, field.name), getattr(given, field.name))
+    assert demonstrations.states is None  # they would only travel along
+    assert data.starts is None
 
 
 def test_guidance_reads_no_padding():
@@ -292,6 +328,41 @@ def test_guidance_reads_no_padding():
     for name in ("epsilon", "behavioural_goals", "scale"):
         chex.assert_trees_all_close(getattr(found, name), getattr(expected, name))
     assert goals_of(found.goals) == goals_of(expected.goals)
+
+
+def test_training_episodes_may_begin_in_demonstrated_states_and_evaluations_never_do():
+    env, config = make_env(), make_config(demo_reset_ratio=1.0, batch=BatchConfig(n_step=1))
+    demonstrations = corridor_demonstrations((1.0, 1.25, 0.9), env=env)
+    data = train.guidance(demonstrations, env, config)
+    assert int(data.starts.count) == int(demonstrations.lengths.sum()) == 14
+    assert data.demonstrations.states is None
+
+    @functools.partial(jax.jit, compiler_options=FAST_COMPILATION)
+    def run(key):
+        state = train.init(key, data, env, config)
+        state = with_output_bias(train.collect(state, data, env=env, config=config, num_iterations=60), [0.0, 0.0, 0.0, 0.0])
+        return state.replay, train.evaluate(key, state.agent.actor, data, env=env, config=config, num_episodes=20)
+
+    replay, evaluation = jax.device_get(run(jax.random.key(0)))
+    begun = set()
+    for row in np.flatnonzero(replay.episodes.lengths):
+        observations, length = replay.episodes.observations[row], replay.episodes.lengths[row]
+        demo, start = int(observations[0, 0]) - 10, int(observations[0, 1])
+        np.testing.assert_array_equal(observations[0], demonstrations.observations[demo, start])
+        assert start < demonstrations.lengths[demo]
+        assert observations[: length + 1, 1].tolist() == list(range(start, start + length + 1))  # the steps are counted on
+        assert start + length == HORIZON or replay.episodes.terminated[row]
+        begun.add((demo, start))
+    assert len(begun) > 7  # of 14
+    assert evaluation.length.tolist() == [5] * 20  # from 0, velocity 1 passes 4 in the fifth step
+
+
+def test_demonstrations_without_states_cannot_be_begun_in():
+    demonstrations = corridor_demonstrations(TWO_SPEEDS).replace(states=None)
+    config = make_config(demo_reset_ratio=0.1)
+    with pytest.raises(UserError, match=r"demo_reset_ratio = 0\.1 needs the states of the demonstrations"):
+        train.guidance(demonstrations, Corridor(), config)
+    assert train.guidance(demonstrations, Corridor(), make_config()).starts is None
 
 
 def test_behavioural_goal_may_be_the_one_of_the_task():

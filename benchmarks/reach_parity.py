@@ -1,0 +1,168 @@
+"""How far the back ends of the reach arm are from one another: the same commands, and where they bring the hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks import report
+from benchmarks.timing import Options, Row, rounded
+from envs.reach import FixedParameterizedReach, mjx_dynamics, panda, rotations
+from experts.reach import ReachExpert
+from experts.robosuite_arm import RobosuiteArm
+from hindrl_jax.errors import UserError
+from hindrl_jax.types import Array
+
+TITLE = "Reaching, parity of the back ends"
+SEQUENCES = {
+    "zero": "zero",
+    "constant_x": "constant, 20 mm along x",
+    "constant_down": "constant, 20 mm along -z",
+    "constant_roll": "constant, 50 mrad about x",
+    "constant_yaw": "constant, 50 mrad about z",
+    "random": "uniformly random",
+    "smooth": "smooth: random walks, scaled to the bounds",
+    "expert": "those of the expert",
+}
+PAIRS = (("closed_form", "robosuite"), ("mjx", "robosuite"), ("closed_form", "mjx"))
+NAMES = {"closed_form": "closed form", "mjx": "MJX", "robosuite": "robosuite"}
+NUM_STARTS = 5
+NUM_STEPS = 100
+QUICK_STEPS = 10
+
+
+def run(options: Options) -> list[Row]:
+    """One row per sequence and pair of back ends: the distance and the angle between their hands. None at all without robosuite."""
+    num_starts, num_steps = (1, QUICK_STEPS) if options.quick else (NUM_STARTS, NUM_STEPS)
+    print(f"{TITLE}: mean / largest over {num_steps} control steps", flush=True)
+    try:
+        arm = RobosuiteArm()
+    except UserError as error:
+        print(f"  left out: {error}", flush=True)
+        return []
+    closed_form, mjx = FixedParameterizedReach(), FixedParameterizedReach(backend="mjx")
+    starts, commands = sequences(jax.random.key(0), closed_form, num_starts, num_steps)
+    joints = {
+        "closed_form": simulate(panda.control_step, starts, commands, closed_form.compiler_options),
+        "mjx": simulate(mjx_dynamics.control_step, starts, commands, mjx.compiler_options),
+        "robosuite": simulate_in_robosuite(arm, starts, commands),
+    }
+    arm.close()
+
+    away, _ = errors(starts[:, :, None], joints["robosuite"])
+    pairs = {pair: errors(joints[pair[0]], joints[pair[1]]) for pair in PAIRS}
+    rows = []
+    for index, name in enumerate(SEQUENCES):
+        for (first, second), (distance, angle) in pairs.items():
+            row: Row = {"commands": name, "first": first, "second": second, "starts": num_starts, "steps": num_steps}
+            row["away_mm"] = rounded(1000.0 * float(away[index].max(axis=1).mean()))
+            for what, values in (("position_mm", distance[index]), ("rotation_mrad", angle[index])):
+                row |= {what: rounded(1000.0 * float(values.mean())), f"{what}_max": rounded(1000.0 * float(values.max()))}
+            pair = f"{NAMES[first]} - {NAMES[second]}"
+            print(f"  {name:14s} {pair:24s} {_cell(row, 'position_mm'):>15s} mm {_cell(row, 'rotation_mrad'):>15s} mrad", flush=True)
+            rows.append(row)
+    return rows
+
+
+def sequences(key: Array, env: FixedParameterizedReach, num_starts: int, num_steps: int) -> tuple[Array, Array]:
+    """Draws the starts and the commands.
+
+    Returns:
+      Joints (len(SEQUENCES), N, 7) in rad, and commands (len(SEQUENCES), N, T, 6) in m and rad.
+    """
+    key_starts, key_random, key_walk, key_expert = jax.random.split(key, 4)
+    states, _ = jax.vmap(jax.vmap(env.reset))(jax.random.split(key_starts, (len(SEQUENCES), num_starts)))
+    shape = (num_starts, num_steps, env.action_dim)
+    x, _, z, roll, _, yaw = jnp.eye(env.action_dim)
+    directions = {"zero": jnp.zeros_like(x), "constant_x": x, "constant_down": -z, "constant_roll": roll, "constant_yaw": yaw}
+    walk = jnp.cumsum(jax.random.normal(key_walk, shape), axis=1)
+    normalised = {name: jnp.broadcast_to(direction, shape) for name, direction in directions.items()} | {
+        "random": jax.random.uniform(key_random, shape, minval=-1.0, maxval=1.0),
+        "smooth": walk / jnp.max(jnp.abs(walk), axis=1, keepdims=True),
+    }
+    commands = {name: values * jnp.broadcast_to(env.action_high, shape) for name, values in normalised.items()}
+
+    def by_expert(state: Any, key: Array) -> tuple[Any, Array]:
+        action = ReachExpert().act(key, env, state)
+        return env.step(state, action)[0], action
+
+    at_start = jax.tree.map(lambda leaf: leaf[list(SEQUENCES).index("expert")], states)
+    play = jax.jit(jax.vmap(lambda state, keys: jax.lax.scan(by_expert, state, keys)[1]))
+    commands["expert"] = play(at_start, jax.random.split(key_expert, (num_starts, num_steps)))
+    return states.joints, jnp.stack([commands[name] for name in SEQUENCES])
+
+
+def simulate(control_step: Callable[..., tuple[Array, Array]], starts: Array, commands: Array, compiler_options: dict[str, Any]) -> Array:
+    """Joints (..., T, 7) after each of the commands (..., T, 6), from rest at joints (..., 7)."""
+
+    def arm(rest: Array, sequence: Array) -> Array:
+        def step(carry: tuple[Array, Array], command: Array) -> tuple[tuple[Array, Array], Array]:
+            carry = control_step(*carry, rest, command)
+            return carry, carry[0]
+
+        return jax.lax.scan(step, (rest, jnp.zeros_like(rest)), sequence)[1]
+
+    flat = starts.reshape(-1, starts.shape[-1]), commands.reshape(-1, *commands.shape[-2:])
+    joints = jax.jit(jax.vmap(arm), compiler_options=compiler_options)(*flat)
+    return joints.reshape(*commands.shape[:-1], panda.NUM_JOINTS)
+
+
+def simulate_in_robosuite(arm: RobosuiteArm, starts: Array, commands: Array) -> Array:
+    """The same as `simulate`."""
+    starts, commands = np.asarray(starts), np.asarray(commands)
+    joints = np.zeros((*commands.shape[:-1], panda.NUM_JOINTS), np.float32)
+    for index in np.ndindex(commands.shape[:-2]):
+        arm.reset(starts[index])
+        for t, command in enumerate(commands[index]):
+            joints[*index, t], _ = arm.step(command)
+    return jnp.asarray(joints)
+
+
+@jax.jit
+def errors(first: Array, second: Array) -> tuple[Array, Array]:
+    """Distances (...) in m and angles (...) in rad between the hands at two arrays of joints (..., 7), by the same forward kinematics."""
+
+    def between(first: Array, second: Array) -> tuple[Array, Array]:
+        one, other = panda.posture(first), panda.posture(second)
+        displacement, turn = other.hand_position - one.hand_position, rotations.between(one.hand_rotation, other.hand_rotation)
+        return jnp.sqrt(jnp.sum(jnp.square(displacement))), jnp.sqrt(jnp.sum(jnp.square(turn)))
+
+    return jnp.vectorize(between, signature="(n),(n)->(),()")(first, second)
+
+
+def versions(options: Options) -> dict[str, str]:
+    """Versions of what moves the arm."""
+    del options
+    return report.installed("mujoco", "mujoco-mjx", "robosuite")
+
+
+def tables(rows: list[Row]) -> str:
+    """A line per sequence, two columns per pair, and the largest of each pair."""
+    text = (
+        "Distance (mm) and angle (mrad) between the hands that two back ends have moved by the same commands from the same start: mean / largest "
+        f"over {rows[0]['steps']} control steps and {rows[0]['starts']} starts, which have the noise of an episode's. How far the hand gets away from its "
+        "start is told by robosuite, and is the mean over the starts. All poses come from the joints by `panda.posture`.\n\n"
+    )
+    names = {pair: f"{NAMES[pair[0]]} - {NAMES[pair[1]]}" for pair in PAIRS}
+    header = ["commands", "gets away, mm", *(f"{name}, {unit}" for name in names.values() for unit in ("mm", "mrad"))]
+    by_case = {(row["commands"], row["first"], row["second"]): row for row in rows}
+    lines = []
+    for name in dict.fromkeys(row["commands"] for row in rows):
+        of_pairs = [by_case[name, *pair] for pair in PAIRS]
+        cells = [_cell(row, what) for row in of_pairs for what in ("position_mm", "rotation_mrad")]
+        lines.append([SEQUENCES[name], f"{of_pairs[0]['away_mm']:.0f}", *cells])
+    text += report.table(header, lines)
+    for pair, name in names.items():
+        largest = {
+            what: max(row[f"{what}_max"] for row in rows if (row["first"], row["second"]) == pair) for what in ("position_mm", "rotation_mrad")
+        }
+        text += f"\n- Largest of all, {name}: {largest['position_mm']:.3f} mm, {largest['rotation_mrad']:.3f} mrad."
+    return text + "\n"
+
+
+def _cell(row: Row, what: str) -> str:
+    return f"{row[what]:.3f} / {row[f'{what}_max']:.3f}"
