@@ -144,8 +144,8 @@ def tables(rows: list[Row]) -> str:
     """A line per sequence, two columns per pair, and the largest of each pair."""
     text = (
         "Distance (mm) and angle (mrad) between the hands that two back ends have moved by the same commands from the same start: mean / largest "
-        f"over {rows[0]['steps']} control steps and {rows[0]['starts']} starts, which have the noise of an episode's. How far the hand gets away from its "
-        "start is told by robosuite, and is the mean over the starts. All poses come from the joints by `panda.posture`.\n\n"
+        f"over {rows[0]['steps']} control steps and {rows[0]['starts']} starts, which have the noise of an episode's. How far robosuite's hand gets "
+        "away from its start is the mean over the starts. All poses come from the joints by `panda.posture`.\n\n"
     )
     names = {pair: f"{NAMES[pair[0]]} - {NAMES[pair[1]]}" for pair in PAIRS}
     header = ["commands", "gets away, mm", *(f"{name}, {unit}" for name in names.values() for unit in ("mm", "mrad"))]
@@ -157,9 +157,8 @@ def tables(rows: list[Row]) -> str:
         lines.append([SEQUENCES[name], f"{of_pairs[0]['away_mm']:.0f}", *cells])
     text += report.table(header, lines)
     for pair, name in names.items():
-        largest = {
-            what: max(row[f"{what}_max"] for row in rows if (row["first"], row["second"]) == pair) for what in ("position_mm", "rotation_mrad")
-        }
+        of_pair = [row for row in rows if (row["first"], row["second"]) == pair]
+        largest = {what: max(row[f"{what}_max"] for row in of_pair) for what in ("position_mm", "rotation_mrad")}
         text += f"\n- Largest of all, {name}: {largest['position_mm']:.3f} mm, {largest['rotation_mrad']:.3f} mrad."
     return text + "\n"
 

@@ -97,7 +97,7 @@ def test_the_given_share_of_episodes_begins_in_demonstrated_states(ratio):
     demonstrated = state.observation[:, 0] >= 10
     assert abs(demonstrated.sum() - 3000 * ratio) <= 5 * np.sqrt(3000 * ratio * (1 - ratio))
     assert np.all(state.observation[~demonstrated][:, 1:] == 0.0)  # the environment's own start
-    assert len(np.unique(state.observation[~demonstrated][:, 0])) == (~demonstrated).sum()
+    assert len(np.unique(state.observation[~demonstrated][:, 0])) >= (~demonstrated).sum() - 10  # of 2^23 possible ones
     assert set(state.desired_goal[:, 0].tolist()) == {7.0, 8.0, 9.0}  # goals are drawn as ever
     if ratio == 0.0:
         return

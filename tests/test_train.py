@@ -339,9 +339,10 @@ def test_training_episodes_may_begin_in_demonstrated_states_and_evaluations_neve
 
     @functools.partial(jax.jit, compiler_options=FAST_COMPILATION)
     def run(key):
-        state = train.init(key, data, env, config)
+        key_init, key_evaluate = jax.random.split(key)
+        state = train.init(key_init, data, env, config)
         state = with_output_bias(train.collect(state, data, env=env, config=config, num_iterations=60), [0.0, 0.0, 0.0, 0.0])
-        return state.replay, train.evaluate(key, state.agent.actor, data, env=env, config=config, num_episodes=20)
+        return state.replay, train.evaluate(key_evaluate, state.agent.actor, data, env=env, config=config, num_episodes=20)
 
     replay, evaluation = jax.device_get(run(jax.random.key(0)))
     begun = set()
