@@ -30,9 +30,11 @@ SEQUENCES = {
 }
 PAIRS = (("closed_form", "robosuite"), ("mjx", "robosuite"), ("closed_form", "mjx"))
 NAMES = {"closed_form": "closed form", "mjx": "MJX", "robosuite": "robosuite"}
-NUM_STARTS = 5
+NUM_STARTS = 10
 NUM_STEPS = 100
 QUICK_STEPS = 10
+NEAR_LIMIT = 0.005  # rad
+MEASURED = ("position_mm", "rotation_mrad")
 
 
 def run(options: Options) -> list[Row]:
@@ -55,13 +57,17 @@ def run(options: Options) -> list[Row]:
 
     away, _ = errors(starts[:, :, None], joints["robosuite"])
     pairs = {pair: errors(joints[pair[0]], joints[pair[1]]) for pair in PAIRS}
+    limited = np.asarray(meets_limit(joints["robosuite"]))
     rows = []
     for index, name in enumerate(SEQUENCES):
-        for (first, second), (distance, angle) in pairs.items():
-            row: Row = {"commands": name, "first": first, "second": second, "starts": num_starts, "steps": num_steps}
+        for (first, second), both in pairs.items():
+            row: Row = {"commands": name, "first": first, "second": second, "steps": num_steps}
+            row |= {"starts": num_starts, "starts_at_limit": int(limited[index].sum())}
             row["away_mm"] = rounded(1000.0 * float(away[index].max(axis=1).mean()))
-            for what, values in (("position_mm", distance[index]), ("rotation_mrad", angle[index])):
-                row |= {what: rounded(1000.0 * float(values.mean())), f"{what}_max": rounded(1000.0 * float(values.max()))}
+            for what, values in zip(MEASURED, both, strict=True):
+                values = 1000.0 * np.asarray(values[index])
+                free = values[~limited[index]]
+                row |= {what: rounded(values.mean()), f"{what}_max": rounded(values.max()), f"{what}_max_free": rounded(free.max(initial=0.0))}
             pair = f"{NAMES[first]} - {NAMES[second]}"
             print(f"  {name:14s} {pair:24s} {_cell(row, 'position_mm'):>15s} mm {_cell(row, 'rotation_mrad'):>15s} mrad", flush=True)
             rows.append(row)
@@ -134,6 +140,13 @@ def errors(first: Array, second: Array) -> tuple[Array, Array]:
     return jnp.vectorize(between, signature="(n),(n)->(),()")(first, second)
 
 
+def meets_limit(joints: Array) -> Array:
+    """(...) bool, whether on its way (..., T, 7) any joint comes to the end of its range."""
+    chain = panda.chain()
+    to_limit = jnp.minimum(joints - jnp.broadcast_to(chain.lower, joints.shape), jnp.broadcast_to(chain.upper, joints.shape) - joints)
+    return (to_limit < NEAR_LIMIT).any(axis=(-2, -1))
+
+
 def versions(options: Options) -> dict[str, str]:
     """Versions of what moves the arm."""
     del options
@@ -145,21 +158,25 @@ def tables(rows: list[Row]) -> str:
     text = (
         "Distance (mm) and angle (mrad) between the hands that two back ends have moved by the same commands from the same start: mean / largest "
         f"over {rows[0]['steps']} control steps and {rows[0]['starts']} starts, which have the noise of an episode's. How far robosuite's hand gets "
-        "away from its start is the mean over the starts. All poses come from the joints by `panda.posture`.\n\n"
+        "away from its start is the mean over the starts. A start is at a limit if a joint of robosuite's arm comes to the end of its range. All "
+        "poses come from the joints by `panda.posture`.\n\n"
     )
     names = {pair: f"{NAMES[pair[0]]} - {NAMES[pair[1]]}" for pair in PAIRS}
-    header = ["commands", "gets away, mm", *(f"{name}, {unit}" for name in names.values() for unit in ("mm", "mrad"))]
+    header = ["commands", "gets away, mm", "starts at a limit", *(f"{name}, {unit}" for name in names.values() for unit in ("mm", "mrad"))]
     by_case = {(row["commands"], row["first"], row["second"]): row for row in rows}
     lines = []
     for name in dict.fromkeys(row["commands"] for row in rows):
         of_pairs = [by_case[name, *pair] for pair in PAIRS]
-        cells = [_cell(row, what) for row in of_pairs for what in ("position_mm", "rotation_mrad")]
-        lines.append([SEQUENCES[name], f"{of_pairs[0]['away_mm']:.0f}", *cells])
+        cells = [_cell(row, what) for row in of_pairs for what in MEASURED]
+        lines.append([SEQUENCES[name], f"{of_pairs[0]['away_mm']:.0f}", of_pairs[0]["starts_at_limit"], *cells])
     text += report.table(header, lines)
     for pair, name in names.items():
         of_pair = [row for row in rows if (row["first"], row["second"]) == pair]
-        largest = {what: max(row[f"{what}_max"] for row in of_pair) for what in ("position_mm", "rotation_mrad")}
-        text += f"\n- Largest of all, {name}: {largest['position_mm']:.3f} mm, {largest['rotation_mrad']:.3f} mrad."
+        largest, free = (
+            " and ".join(f"{max(row[f'{what}_{kind}'] for row in of_pair):.3f} {unit}" for what, unit in zip(MEASURED, ("mm", "mrad"), strict=True))
+            for kind in ("max", "max_free")
+        )
+        text += f"\n- {name}, largest of all: {largest}; without the starts at a limit: {free}."
     return text + "\n"
 
 

@@ -75,7 +75,7 @@ def starts(num_envs: int) -> Array:
 
 
 def commands(num_envs: int) -> Array:
-    """(NUM_COMMANDS, E, 6) displacements in m and rotation vectors in rad; the second half takes back the first, so that no arm wanders off."""
+    """(NUM_COMMANDS, E, 6) displacements in m and rotation vectors in rad; the second half takes back the first, lest the arms wander off."""
     env = FixedParameterizedReach()
     there = jax.random.uniform(jax.random.key(1), (NUM_COMMANDS // 2, num_envs, env.action_dim), minval=env.action_low, maxval=env.action_high)
     return jnp.concatenate([there, -there])

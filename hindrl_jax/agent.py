@@ -126,10 +126,10 @@ def init(key: Array, config: AgentConfig, *, observation_dim: int, goal_dim: int
     )
 
 
-def select_action(actor: Params, inputs: Array, config: AgentConfig, *, action_dim: int, noise: Array | None = None) -> Array:
-    """Actions (B, A) in [-1, 1] at inputs (B, input_dim), see `network_inputs`: what standard normal noise (B, A) leads to, or the policy's mode."""
+def select_action(key: Array, actor: Params, inputs: Array, config: AgentConfig, *, action_dim: int, stochastic: bool) -> Array:
+    """Actions (B, A) in [-1, 1] at inputs (B, input_dim), see `network_inputs`: sampled from the policy, or its mode."""
     distribution = apply_actor(actor, inputs.T, config, action_dim=action_dim)
-    return (distribution.mode if noise is None else distribution.at(noise.T)[0]).T
+    return (distribution.sample(key)[0] if stochastic else distribution.mode).T
 
 
 @struct.dataclass(kw_only=True)

@@ -177,9 +177,6 @@ class TrainConfig:
     """Gradient steps after each (vectorised) environment step."""
     learning_starts: int = 6_400
     """Environment steps with uniformly random actions before the first gradient step; at least one horizon in each environment is taken."""
-    noise_correlation: float = 0.0
-    """Correlation of the exploration noise of one step with that of the next, in each action dimension; 0 draws it anew at each step. Where a single
-    action moves little, as with a robot arm at 20 Hz, independent noise averages out before it explores anything."""
     demo_reset_ratio: float = 0.0
     """Share of training episodes that begin in a demonstrated state, drawn uniformly, with the steps that it had left (Nair et al., overcoming
     exploration in reinforcement learning with demonstrations, 2018). Evaluations never do."""
@@ -201,7 +198,6 @@ class TrainConfig:
             **{name: (getattr(self, name) >= 1, "at least 1") for name in counts},
             learning_starts=(self.learning_starts >= 0, "0 or more"),
             demo_reset_ratio=(0.0 <= self.demo_reset_ratio <= 1.0, "between 0 and 1"),
-            noise_correlation=(0.0 <= self.noise_correlation < 1.0, "in [0, 1)"),
         )
         if self.algo == "tqcfd" and self.batch.num_sampled_goals > 0:
             raise ValueError(f"tqcfd does not relabel, but num_sampled_goals = {self.batch.num_sampled_goals}: set it to 0, or choose hindrl")

@@ -7,7 +7,6 @@ over its gradient steps.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -45,7 +44,6 @@ class TrainState:
     agent: AgentState
     replay: ReplayState
     rollout: RolloutState
-    exploration: Array  # (E, A) the standard normal noise behind the latest actions
     key: Array
     env_steps: Array  # () int32
     updates: Array  # () int32
@@ -111,7 +109,6 @@ def init(key: Array, data: Guidance, env: Environment, config: TrainConfig) -> T
         agent=agents.init(key_agent, config.agent, **dims),
         replay=replay.init(num_envs=config.num_envs, capacity=smallest if config.algo == "bc" else config.buffer_size, horizon=env.horizon, **dims),
         rollout=_new_episodes(key_rollout, data, env, config),
-        exploration=jnp.zeros((config.num_envs, env.action_dim)),
         key=key_train,
         env_steps=jnp.asarray(0),
         updates=jnp.asarray(0),
@@ -133,30 +130,16 @@ def make_policy(actor: Any, scale: InputScale, env: Environment, config: TrainCo
 
     def act(key: Array, observation: Array, desired_goal: Array) -> Array:
         inputs = agents.network_inputs(observation, env.achieved_goal(observation), desired_goal, scale, config.agent)
-        noise = _normal(key, observation.shape[0], env) if stochastic else None
-        return agents.select_action(actor, inputs, config.agent, action_dim=env.action_dim, noise=noise)
+        return agents.select_action(key, actor, inputs, config.agent, action_dim=env.action_dim, stochastic=stochastic)
 
     return act
 
 
-def _normal(key: Array, num_rows: int, env: Environment) -> Array:
-    return jax.random.normal(key, (env.action_dim, num_rows)).T
-
-
-def _explore(key: Array, state: TrainState, env: Environment, config: TrainConfig) -> Array:
-    """The next noise (E, A): standard normal at each step, correlated from one step to the next by `noise_correlation` (an AR(1) process)."""
-    fresh, kept = _normal(key, state.exploration.shape[0], env), config.noise_correlation
-    return kept * state.exploration + (1.0 - kept**2) ** 0.5 * fresh
-
-
-def _interact(
-    key: Array, state: TrainState, data: Guidance, env: Environment, config: TrainConfig, act: Callable[[Array, RolloutState], Array]
-) -> TrainState:
-    """One step of every environment, stored in the replay; `act` turns noise (E, A) and the rollout into actions (E, A)."""
-    key_noise, key_reset = jax.random.split(key)
+def _interact(key: Array, state: TrainState, data: Guidance, env: Environment, config: TrainConfig, act: Act) -> TrainState:
+    """One step of every environment, stored in the replay."""
+    key_act, key_reset = jax.random.split(key)
     before = state.rollout
-    noise = _explore(key_noise, state, env, config)
-    action = act(noise, before)
+    action = act(key_act, before.observation, before.desired_goal)
     after, time_step = rollout.step(before, _new_episodes(key_reset, data, env, config), action, env)
     stored = replay.add(
         state.replay,
@@ -168,14 +151,14 @@ def _interact(
         terminated=time_step.terminated,
         truncated=time_step.truncated,
     )
-    return state.replace(replay=stored, rollout=after, exploration=noise, env_steps=state.env_steps + action.shape[0])
+    return state.replace(replay=stored, rollout=after, env_steps=state.env_steps + action.shape[0])
 
 
 def collect(state: TrainState, data: Guidance, *, env: Environment, config: TrainConfig, num_iterations: int) -> TrainState:
     """Fills the replay by uniformly random actions: `num_iterations` steps of every environment."""
 
-    def uniform(noise: Array, before: RolloutState) -> Array:
-        return 2.0 * jax.scipy.stats.norm.cdf(noise) - 1.0
+    def uniform(key: Array, observation: Array, desired_goal: Array) -> Array:
+        return jax.random.uniform(key, (observation.shape[0], env.action_dim), minval=-1.0, maxval=1.0)
 
     def iteration(state: TrainState, _: None) -> tuple[TrainState, None]:
         key, key_interact = jax.random.split(state.key)
@@ -200,13 +183,7 @@ def learn(state: TrainState, data: Guidance, *, env: Environment, config: TrainC
 
     def iteration(state: TrainState, _: None) -> tuple[TrainState, Metrics]:
         key, key_interact, key_batch, key_updates = jax.random.split(state.key, 4)
-        actor = state.agent.actor
-
-        def act(noise: Array, before: RolloutState) -> Array:
-            achieved = env.achieved_goal(before.observation)
-            inputs = agents.network_inputs(before.observation, achieved, before.desired_goal, data.scale, config.agent)
-            return agents.select_action(actor, inputs, config.agent, action_dim=env.action_dim, noise=noise)
-
+        act = make_policy(state.agent.actor, data.scale, env, config, stochastic=True)
         state = _interact(key_interact, state.replace(key=key), data, env, config, act)
         draw = functools.partial(
             replay.sample_batch,

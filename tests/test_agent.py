@@ -103,7 +103,7 @@ def values(state, observation, action):
 @jax.jit
 def mean_action(state, observation):
     inputs = inputs_of(observation, CONFIG)
-    return agents.select_action(state.actor, inputs, CONFIG, action_dim=1)
+    return agents.select_action(jax.random.key(0), state.actor, inputs, CONFIG, action_dim=1, stochastic=False)
 
 
 ACTIONS = np.linspace(-1.0, 1.0, B, dtype=np.float32)[:, None]
@@ -324,11 +324,11 @@ def test_actions_by_hand():
     shapes = jax.eval_shape(lambda key: agents.init(key, CONFIG, observation_dim=2, goal_dim=1, action_dim=2), jax.random.key(0)).actor
     actor = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes)
     actor["params"]["Dense_1"]["bias"] = jnp.array([0.5, -1.0, np.log(0.1), np.log(2.0)])  # means, and logarithms of the deviations
-    select = functools.partial(agents.select_action, actor, jnp.ones((3, 3)), CONFIG, action_dim=2)
-    # Mean plus deviation times noise: (0.5 + 0.1 n, -1 + 2 n').
-    sampled = select(noise=jnp.array([[0.0, 0.0], [1.0, -1.0], [-2.0, 0.5]]))
-    np.testing.assert_allclose(sampled, np.tanh([[0.5, -1.0], [0.6, -3.0], [0.3, 0.0]]), atol=1e-6)
-    np.testing.assert_allclose(select(), np.tanh([[0.5, -1.0]] * 3), atol=1e-6)
+    key = jax.random.key(1)
+    mode, sampled = (agents.select_action(key, actor, jnp.ones((3, 3)), CONFIG, action_dim=2, stochastic=stochastic) for stochastic in (False, True))
+    np.testing.assert_allclose(mode, np.tanh([[0.5, -1.0]] * 3), atol=1e-6)
+    noise = np.asarray(jax.random.normal(key, (2, 3))).T  # one column per row of the batch
+    np.testing.assert_allclose(sampled, np.tanh([0.5, -1.0] + np.array([0.1, 2.0]) * noise), atol=1e-6)
 
 
 def test_initial_alpha():

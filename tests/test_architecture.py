@@ -33,7 +33,7 @@ EXPERTS = sorted((ROOT / "experts").rglob("*.py"))
 # What single modules may import beyond the others of their kind. robosuite is found and silenced in one module; a person plays in real time.
 BEYOND = {
     "panda": {"mujoco", "pathlib"},  # to read the model's file
-    "mjx_dynamics": {"mujoco", "logging"},
+    "mjx_dynamics": {"mujoco", "contextlib", "io"},
     "robosuite_arm": {"robosuite", "mujoco", "contextlib", "importlib", "io", "logging", "os", "sys", "warnings"},
     "by_hand": {"contextlib", "time"},
 }

@@ -98,7 +98,6 @@ BAD = [
     (TrainConfig, "num_envs", [0]),
     (TrainConfig, "updates_per_iteration", [0]),
     (TrainConfig, "learning_starts", [-1]),
-    (TrainConfig, "noise_correlation", [-0.1, 1.0, float("nan")]),
     (TrainConfig, "demo_reset_ratio", [-0.1, 1.1, None]),
     (TrainConfig, "buffer_size", [0, 1e6]),
     (TrainConfig, "eval_every", [0]),
@@ -125,7 +124,7 @@ def test_the_table_of_bad_values_is_complete():
         lambda: BatchConfig(max_demo_ratio=0, gamma=1, reach_zero=None, num_sampled_goals=0.5),  # an int serves as a float
         lambda: AgentConfig(num_quantiles=25, top_quantiles_to_drop_per_net=24, target_entropy=-3.0, bc_weight=0, net_arch=(1,)),
         lambda: TrainConfig(algo="bc", steps=1, learning_starts=5),  # cloning takes no environment steps
-        lambda: TrainConfig(demo_reset_ratio=1, noise_correlation=0),
+        lambda: TrainConfig(demo_reset_ratio=1),
     ],
 )
 def test_values_at_the_edge_are_accepted(build):

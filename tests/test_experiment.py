@@ -1,6 +1,7 @@
 """Running experiments: thresholds of the summary, exact length of a run, and seeds that do not depend on each other."""
 
 import dataclasses
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -148,11 +149,36 @@ def test_what_does_not_fit_is_refused(changes, message, demonstrations):
         hindrl.fit(given.env, tables, given.config, seeds=given.seeds)
 
 
-def test_damaged_parameters_are_refused(demonstrations, tmp_path):
-    result = hindrl.fit(ENV, demonstrations, dataclasses.replace(CONFIG, algo="bc", steps=2), seeds=[0])
-    hindrl.save_run(tmp_path, result)
+@pytest.fixture(scope="module")
+def saved(demonstrations, tmp_path_factory):
+    """A result and the directory that it was saved in."""
+    config = dataclasses.replace(CONFIG, algo="bc", steps=2, agent=dataclasses.replace(CONFIG.agent, input_encoding="standardised"))
+    result, path = hindrl.fit(ENV, demonstrations, config, seeds=[0]), tmp_path_factory.mktemp("runs")
+    hindrl.save_run(path, result)
+    return result, path
+
+
+def test_a_saved_run_sees_its_inputs_as_it_did_in_training(saved, tmp_path):
+    result, path = saved
+    scale = hindrl.load_run(path).scale
+    chex.assert_trees_all_equal(scale, result.guidance.scale)
+    assert np.abs(scale.observation_centre).max() > 0.1
+    # Runs from before there were centres had them at 0.
+    older = shutil.copytree(path, tmp_path / "older")
+    with np.load(path / "parameters.npz") as archive:
+        np.savez(older / "parameters.npz", **{name: archive[name] for name in archive.files if not name.endswith("_centre")})
+    scale = hindrl.load_run(older).scale
+    np.testing.assert_array_equal(scale.observation, result.guidance.scale.observation)
+    assert not scale.observation_centre.any()
+    assert not scale.goal_centre.any()
+    assert scale.goal_centre.shape == scale.goal.shape == (1, ENV.goal_dim)
+
+
+def test_damaged_parameters_are_refused(saved, tmp_path):
+    result, path = saved
     with pytest.raises(hindrl.UserError, match="already holds a run"):
-        hindrl.save_run(tmp_path, result)
+        hindrl.save_run(path, result)
+    tmp_path = shutil.copytree(path, tmp_path / "copy")
     file = tmp_path / "parameters.npz"
     file.write_bytes(file.read_bytes()[:200])
     with pytest.raises(hindrl.UserError, match="damaged"):

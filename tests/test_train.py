@@ -164,39 +164,6 @@ def test_actions_are_uniform_at_first_and_the_policys_when_learning(learnt):
     assert len(first_of_policy) == NUM_ENVS  # sampled: the mean action is the same in all environments
 
 
-@pytest.mark.parametrize("correlation", [0.0, 0.8])
-def test_exploration_noise_is_correlated_from_step_to_step_and_standard_normal(correlation, data):
-    config, env = make_config(num_envs=400, noise_correlation=correlation, buffer_size=10**6), make_env()
-
-    @functools.partial(jax.jit, compiler_options=FAST_COMPILATION)
-    def run(key):
-        def step(state, _):
-            state = train.collect(state, data, env=env, config=config, num_iterations=1)
-            return state, state.exploration
-
-        return jax.lax.scan(step, train.init(key, data, env, config), length=40)
-
-    state, noise = jax.device_get(run(jax.random.key(0)))
-    noise = noise[30:].astype(float)  # (10, 400, 2), long after the start at 0
-    assert noise.shape == (10, 400, 2)
-    # 4,000 numbers in each dimension; neighbours share their information, so the deviations are up to 3 times 1 / sqrt(4000).
-    np.testing.assert_allclose(noise.mean(axis=(0, 1)), 0.0, atol=0.2)
-    np.testing.assert_allclose(noise.var(axis=(0, 1)), 1.0, atol=0.2)
-    for lag in (1, 2):
-        np.testing.assert_allclose((noise[lag:] * noise[:-lag]).mean(axis=(0, 1)), correlation**lag, atol=0.15)
-    assert abs((noise[..., 0] * noise[..., 1]).mean()) < 0.15  # dimensions and environments do not depend on each other
-    assert abs((noise[:, :200] * noise[:, 200:]).mean()) < 0.15
-    # The stored actions are made of it, and uniform.
-    replay = state.replay
-    slots = replay.episodes.lengths.shape[0] // 400
-    rows = np.arange(400) * slots + replay.slot
-    under_way = replay.step > 0
-    latest = replay.episodes.actions[rows, replay.step - 1][under_way]
-    np.testing.assert_allclose(latest, 2.0 * jax.scipy.stats.norm.cdf(noise[-1][under_way]) - 1.0, atol=1e-5)
-    assert latest.std() == pytest.approx(3**-0.5, abs=0.05)
-    assert np.abs(latest).max() < 1.0
-
-
 def stack(*trees):
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
 
@@ -440,10 +407,12 @@ def grid_demonstrations(env, num):
         lengths=jnp.full(num, 6),
         terminated=jnp.ones(num, bool),
         desired_goals=jnp.zeros((num, env.goal_dim)),
+        states=jnp.zeros((num, env.horizon + 1, env.state_dim)),
     )
 
 
 def test_grid_runs_end_to_end():
+    """With everything switched on that is off by default."""
     env = FixedGridPickAndPlace(size=4, random_box_size=1, horizon=8)
     config = TrainConfig(
         num_envs=2,
@@ -451,8 +420,11 @@ def test_grid_runs_end_to_end():
         learning_starts=16,
         buffer_size=64,
         steps=100,
-        batch=BatchConfig(batch_size=8, n_step=2),
-        agent=AgentConfig(net_arch=(8,), num_critics=1, num_quantiles=3, top_quantiles_to_drop_per_net=1),
+        demo_reset_ratio=0.5,
+        batch=BatchConfig(batch_size=8, n_step=2, bound_by_obtained_return=True),
+        agent=AgentConfig(
+            net_arch=(8,), num_critics=1, num_quantiles=3, top_quantiles_to_drop_per_net=1, clip_targets=True, input_encoding="standardised"
+        ),
     )
 
     @functools.partial(jax.jit, compiler_options=FAST_COMPILATION)
@@ -466,5 +438,6 @@ def test_grid_runs_end_to_end():
     state, metrics, evaluation = run(jax.random.key(0))
     chex.assert_tree_all_finite((state.agent, metrics))
     assert (int(state.env_steps), int(state.updates)) == (24, 4)
+    assert 0.0 < metrics["critic/target"] <= 1.0
     assert np.all(np.asarray(evaluation.length) <= 8)
     assert state.replay.episodes.observations.shape == (8, 9, env.observation_dim)

@@ -1,12 +1,14 @@
 """The Panda on MJX: the reference for `panda.control_step`, with MuJoCo's own equations in each of its 25 substeps.
 
-Same inverse kinematics; torques, friction, drag, torque and joint limits as MuJoCo has them. About a hundred times slower on a CPU.
+Same inverse kinematics; friction, drag, torque and joint limits as MuJoCo has them. Some fifty times slower on a CPU, and then only if compiled
+with the environment's `compiler_options`.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
-import logging
+import io
 from typing import Any
 
 import jax
@@ -18,12 +20,9 @@ from hindrl_jax.types import Array
 
 @functools.cache
 def _mjx() -> Any:
-    """The module, without its remark about an absent optional package."""
-    logging.disable(logging.WARNING)
-    try:
+    """The module, without the lines that it prints about an absent optional package."""
+    with contextlib.redirect_stdout(io.StringIO()):
         from mujoco import mjx
-    finally:
-        logging.disable(logging.NOTSET)
     return mjx
 
 

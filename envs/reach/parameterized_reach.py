@@ -73,7 +73,7 @@ class _Reach(abc.ABC):
     orientation: Literal["six_d", "axis_angle"] = "six_d"
     """How the hand's orientation is observed: two columns of its matrix, or the thesis's axis-angle, which jumps."""
     backend: Backend = "closed_form"
-    """Who simulates the arm: closed_form (for bulk training), mjx (MuJoCo's own equations in JAX, a hundred times slower), or robosuite (one
+    """Who simulates the arm: closed_form (for bulk training), mjx (MuJoCo's own equations in JAX, some fifty times slower), or robosuite (one
     arm on the CPU, to record or to evaluate)."""
 
     def __post_init__(self):
