@@ -92,13 +92,15 @@ def sequences(key: Array, env: FixedParameterizedReach, num_starts: int, num_ste
     }
     commands = {name: values * jnp.broadcast_to(env.action_high, shape) for name, values in normalised.items()}
 
-    def by_expert(state: Any, key: Array) -> tuple[Any, Array]:
-        action = ReachExpert().act(key, env, state)
-        return env.step(state, action)[0], action
+    def by_expert(carry: tuple[Any, Array], _: None) -> tuple[tuple[Any, Array], Array]:
+        state, key = carry
+        key, key_act = jax.random.split(key)
+        action = ReachExpert().act(key_act, env, state)
+        return (env.step(state, action)[0], key), action
 
     at_start = jax.tree.map(lambda leaf: leaf[list(SEQUENCES).index("expert")], states)
-    play = jax.jit(jax.vmap(lambda state, keys: jax.lax.scan(by_expert, state, keys)[1]))
-    commands["expert"] = play(at_start, jax.random.split(key_expert, (num_starts, num_steps)))
+    play = jax.jit(jax.vmap(lambda state, key: jax.lax.scan(by_expert, (state, key), length=num_steps)[1]))
+    commands["expert"] = play(at_start, jax.random.split(key_expert, num_starts))
     return states.joints, jnp.stack([commands[name] for name in SEQUENCES])
 
 

@@ -32,7 +32,7 @@ WHO = {
 }
 NUM_ENVS = (1, 16, 64, 256, 1024)
 NUM_COMMANDS = 64  # random commands per arm, drawn beforehand and given over and over
-TURN_SECONDS = 0.4  # of those of the other parts, since there are many contestants
+TURN_SECONDS = 0.3  # of those of the other parts, since there are many contestants
 JOINT_NOISE = FixedParameterizedReach().joint_noise
 
 ControlStep = Callable[[Array, Array, Array, Array], tuple[Array, Array]]

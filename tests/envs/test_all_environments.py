@@ -1,52 +1,77 @@
 """What every environment must satisfy. A new one is added to ENVIRONMENTS, with one line."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from toy_env import FAST_COMPILATION
 
 from envs.grid import FixedGridPickAndPlace, GridPickAndPlace
-from hindrl_jax.types import Environment
+from envs.reach import FixedParameterizedReach, ParameterizedReach
+from hindrl_jax.types import RestorableEnvironment
 
 ENVIRONMENTS = [
     GridPickAndPlace(),
     GridPickAndPlace(num_objects=3, strict_order=False),
     FixedGridPickAndPlace(),
     FixedGridPickAndPlace(num_objects=3),
+    FixedParameterizedReach(horizon=25),
+    ParameterizedReach(horizon=25, num_waypoints=3, orientation="axis_angle"),
 ]
-every_environment = pytest.mark.parametrize("env", ENVIRONMENTS, ids=repr)
+every_environment = pytest.mark.parametrize("env", ENVIRONMENTS, ids=[f"{env.name}-{i}" for i, env in enumerate(ENVIRONMENTS)])
 
 
-def rollout(env, key, num_steps):
-    """One episode of uniformly random actions, not reset at its end: first observation and stacked time steps."""
+def bounds(env, shape):
+    """Lower and upper bounds of actions of this shape, in the environment's units."""
+    return [jnp.broadcast_to(jnp.asarray(bound, jnp.float32), shape) for bound in (env.action_low, env.action_high)]
+
+
+def rollout(env, key):
+    """One episode of uniformly random actions as long as the horizon, not reset at its end: first observation, stacked time steps, and what
+    is observed of each state after a way through a vector."""
     key_reset, key_actions = jax.random.split(key)
     state, observation = env.reset(key_reset)
-    actions = jax.random.uniform(key_actions, (num_steps, env.action_dim), minval=env.action_low, maxval=env.action_high)
-    return observation, jax.lax.scan(env.step, state, actions)[1]
+    low, high = bounds(env, (env.horizon, env.action_dim))
+    actions = jax.random.uniform(key_actions, low.shape, minval=low, maxval=high)
+
+    def step(state, action):
+        state, time_step = env.step(state, action)
+        return state, (time_step, env.observe(env.vector_to_state(state.key, env.state_to_vector(state))))
+
+    return observation, *jax.lax.scan(step, state, actions)[1]
+
+
+@functools.cache
+def episodes(env):
+    """Three episodes, side by side; the first two with the same key."""
+    keys = jax.vmap(jax.random.key)(jnp.array([0, 0, 1]))
+    return jax.device_get(jax.jit(jax.vmap(lambda key: rollout(env, key)), compiler_options=FAST_COMPILATION)(keys))
 
 
 @every_environment
 def test_satisfies_the_protocol(env):
-    assert isinstance(env, Environment)
+    assert isinstance(env, RestorableEnvironment)
     assert isinstance(hash(env), int)
     assert isinstance(env.name, str)
     assert env.name
-    assert env.action_low < env.action_high
+    low, high = bounds(env, (env.action_dim,))
+    assert (low < high).all()
 
 
 @every_environment
 def test_random_episodes_have_the_promised_shapes_and_finite_values(env):
-    num_episodes, num_steps = 3, 20
-    first, steps = jax.jit(jax.vmap(lambda key: rollout(env, key, num_steps)))(jax.random.split(jax.random.key(0), num_episodes))
-    assert first.shape == (num_episodes, env.observation_dim)
-    assert steps.observation.shape == (num_episodes, num_steps, env.observation_dim)
+    first, steps, _ = episodes(env)
+    assert first.shape == (3, env.observation_dim)
+    assert steps.observation.shape == (3, env.horizon, env.observation_dim)
     assert first.dtype == steps.observation.dtype == jnp.float32
     for array, dtype in [(steps.reward, jnp.float32), (steps.terminated, bool), (steps.truncated, bool)]:
-        assert array.shape == (num_episodes, num_steps)
+        assert array.shape == (3, env.horizon)
         assert array.dtype == dtype
     assert np.isfinite(first).all()
     assert np.isfinite(steps.observation).all()
-    assert (np.ptp(np.asarray(steps.observation), axis=1) > 0).any()  # something moves
+    assert (np.ptp(steps.observation, axis=1) > 0).any()  # something moves
 
 
 @every_environment
@@ -67,28 +92,40 @@ def test_state_keeps_its_structure_so_that_it_can_be_scanned(env):
 
 @every_environment
 def test_an_episode_ends_at_the_horizon_or_before(env):
-    _, steps = jax.jit(lambda key: rollout(env, key, env.horizon))(jax.random.key(1))
-    ended = np.asarray(steps.terminated | steps.truncated)
-    assert ended.any()
+    _, steps, _ = episodes(env)
+    ended = steps.terminated | steps.truncated
+    assert ended.any(axis=1).all()
     assert not (steps.terminated & steps.truncated).any()
-    assert not np.asarray(steps.truncated)[:-1].any()
-    np.testing.assert_array_equal(steps.reward, np.asarray(steps.terminated, np.float32))
+    assert not steps.truncated[:, :-1].any()
+    np.testing.assert_array_equal(steps.reward, steps.terminated.astype(np.float32))
 
 
 @every_environment
 def test_actions_are_clipped_to_the_bounds(env):
-    state, _ = jax.jit(env.reset)(jax.random.key(2))
     sign = jnp.where(jnp.arange(env.action_dim) % 2 == 0, 1.0, -1.0)
-    bound = jnp.where(sign > 0, env.action_high, env.action_low)
-    step = jax.jit(env.step)
-    _, clipped = step(state, 100.0 * sign)
-    _, exact = step(state, bound)
-    np.testing.assert_array_equal(clipped.observation, exact.observation)
+    low, high = bounds(env, sign.shape)
+    actions = jnp.stack([100.0 * sign, jnp.where(sign > 0, high, low)])
+
+    def steps(key):
+        state, _ = env.reset(key)
+        return jax.vmap(lambda action: env.step(state, action)[1].observation)(actions)
+
+    clipped, exact = jax.jit(steps, compiler_options=FAST_COMPILATION)(jax.random.key(2))
+    np.testing.assert_array_equal(clipped, exact)
 
 
 @every_environment
 def test_the_same_key_gives_the_same_episode_and_another_key_another(env):
-    run = jax.jit(lambda key: rollout(env, key, 5))
-    first, again, other = (run(jax.random.key(seed)) for seed in (0, 0, 1))
-    np.testing.assert_array_equal(first[1].observation, again[1].observation)
-    assert not np.array_equal(first[1].observation, other[1].observation)
+    _, steps, _ = episodes(env)
+    first, again, other = steps.observation
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+@every_environment
+def test_a_state_survives_the_way_through_a_vector(env):
+    _, steps, restored = episodes(env)
+    np.testing.assert_allclose(restored, steps.observation, atol=1e-6)
+    state, _ = jax.eval_shape(env.reset, jax.random.key(0))
+    vector = jax.eval_shape(env.state_to_vector, state)
+    assert (vector.shape, vector.dtype) == ((env.state_dim,), jnp.float32)
