@@ -15,6 +15,7 @@ import h5py
 import jax
 import numpy as np
 import pytest
+from PIL import Image
 
 from hindrl_jax import cli
 from hindrl_jax.runs import load_run
@@ -280,6 +281,21 @@ def test_demonstrations_longer_than_the_horizon_are_dropped_with_a_warning(demos
         (demonstrations,) = cli._demonstrations(spec)
     assert demonstrations.lengths.tolist() == [lengths[0]]
     assert "horizon" in refusal(capsys, "train", "--demos", demos_file, "--horizon", lengths[0] - 1)
+
+
+def test_demos_plot_draws_what_the_filter_keeps(demos_file, capsys):
+    cli.main(["demos", "plot", str(demos_file), "--m", "0", "--demo", "1"])
+    with Image.open(demos_file.with_suffix(".png")) as picture:
+        assert picture.size[0] > picture.size[1] > 300
+    kept, total = map(int, re.search(r"keeps (\d+) of (\d+) goals", capsys.readouterr().out).groups())
+    with h5py.File(demos_file) as file:
+        observations = file["data/demo_1/obs/observation"][:]
+        final = file["data/demo_1/next_obs/observation"][-1:]
+    goals = np.concatenate([observations, final])
+    assert total == len(goals)
+    assert kept == 1 + (goals[1:] != goals[:-1]).any(axis=1).sum()  # epsilon is 0: only repeated states are dropped
+    for arguments in (["--demo", "2"], ["--m", "-1"], ["--dims", "0", "0"], ["--dims", "0", "99"], ["--to", "picture.gif"]):
+        assert arguments[-1] in refusal(capsys, "demos", "plot", demos_file, *arguments)
 
 
 def test_demos_info_and_render(demos_file, tmp_path, capsys):

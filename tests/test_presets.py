@@ -23,6 +23,17 @@ APPENDIX = {
     "m": 0,
     "k": 0.0,
 }
+# Appendix A.1.2: where the robot task differs. The text of the appendix has lost one of its eight layers.
+APPENDIX_REACH = APPENDIX | {
+    "batch_size": 12_000,
+    "net_arch": (32, 32, 32, 32, 32, 32, 32, 32),
+    "top_quantiles_to_drop_per_net": 8,
+    "buffer_size": 1_000_000,
+    "learning_starts": 5_000,
+    "bc_weight": 0.0,
+    "reach_zero": 1_000_000,
+    "m": 5,
+}
 # What its text leaves to its framework (Stable-Baselines3 with sb3-contrib's TQC).
 FRAMEWORK = {
     "gamma": 0.99,
@@ -55,20 +66,31 @@ def flat(config: TrainConfig) -> dict:
     return values
 
 
+@pytest.mark.parametrize(
+    ("env", "appendix"),
+    [
+        ("GridPickAndPlace", APPENDIX),
+        ("FixedGridPickAndPlace", APPENDIX),
+        ("ParameterizedReach", APPENDIX_REACH),
+        ("FixedParameterizedReach", APPENDIX_REACH),
+    ],
+)
 @pytest.mark.parametrize(("algo", "relabelled", "filtered"), [("tqcfd", 0, False), ("hindrl", 4, False), ("smooth-hindrl", 4, True)])
-def test_thesis_preset_is_the_appendix(algo, relabelled, filtered):
-    values = flat(preset(algo, "thesis"))
-    expected = APPENDIX | FRAMEWORK | {"algo": algo, "num_sampled_goals": relabelled, "epsilon_filtering": filtered}
+def test_thesis_preset_is_the_appendix(algo, relabelled, filtered, env, appendix):
+    values = flat(preset(algo, "thesis", env=env))
+    expected = appendix | FRAMEWORK | {"algo": algo, "num_sampled_goals": relabelled, "epsilon_filtering": filtered}
     assert {name: values[name] for name in expected} == expected
 
 
-def test_thesis_bc_is_the_appendix():
-    values = flat(preset("bc", "thesis"))
+@pytest.mark.parametrize("env", ["FixedGridPickAndPlace", "FixedParameterizedReach"])
+def test_thesis_bc_is_the_appendix(env):
+    values = flat(preset("bc", "thesis", env=env))
     assert (values["batch_size"], values["learning_rate"], values["net_arch"]) == (2_048, 1e-3, (32, 32))
 
 
-def test_original_preset_differs_from_the_thesis_by_the_quirks_alone():
-    thesis, original = flat(preset("hindrl", "thesis")), flat(preset("hindrl", "original"))
+@pytest.mark.parametrize(("env", "more"), [("FixedGridPickAndPlace", {}), ("FixedParameterizedReach", {"misalign_demo_actions": True})])
+def test_original_preset_differs_from_the_thesis_by_the_quirks_alone(env, more):
+    thesis, original = flat(preset("hindrl", "thesis", env=env)), flat(preset("hindrl", "original", env=env))
     assert {name: original[name] for name in original if original[name] != thesis[name]} == {
         "inclusive_goal_test": False,
         "timeouts_are_terminal": True,
@@ -77,7 +99,15 @@ def test_original_preset_differs_from_the_thesis_by_the_quirks_alone():
         "rescale_demo_actions": False,
         "bc_loss": "norm",
         "bc_action": "sample",
-    }
+    } | more
+
+
+def test_default_recipes_differ_by_family_and_the_grid_has_the_defaults_of_the_config():
+    assert preset("hindrl", env="GridPickAndPlace") == preset("hindrl") == TrainConfig()
+    reach = preset("hindrl", env="ParameterizedReach")
+    assert reach == preset("hindrl", env="FixedParameterizedReach") != TrainConfig()
+    assert reach.demo_reset_ratio > 0.0
+    assert preset("tqcfd", env="ParameterizedReach").batch.num_sampled_goals == 0.0
 
 
 def test_field_names_are_unique_across_the_nested_configs():
@@ -94,3 +124,5 @@ def test_unknown_names_are_refused():
         preset("hindlr")
     with pytest.raises(UserError, match="unknown preset"):
         preset("hindrl", "paper")
+    with pytest.raises(UserError, match="unknown environment"):
+        preset("hindrl", env="Reach")

@@ -289,7 +289,7 @@ def test_a_solved_fixed_task_has_the_task_goal_but_for_the_tolerances():
 def test_a_solved_random_task_has_the_task_goal_but_for_the_tolerances():
     env = ParameterizedReach()
     assert env.task_goal().tolist() == [0.0] * 6 + [1.0, 1.0]
-    state, time_step = stay(env, place([FAR, 0.0199 * DIRECTIONS[2]], [TURNED, 0.049 * DIRECTIONS[2]], num_reached=1))
+    _, time_step = stay(env, place([FAR, 0.0199 * DIRECTIONS[2]], [TURNED, 0.049 * DIRECTIONS[2]], num_reached=1))
     assert time_step.terminated
     achieved = np.asarray(env.achieved_goal(time_step.observation))
     assert achieved[6:].tolist() == [1.0, 1.0]
