@@ -324,10 +324,11 @@ def test_actions_by_hand():
     shapes = jax.eval_shape(lambda key: agents.init(key, CONFIG, observation_dim=2, goal_dim=1, action_dim=2), jax.random.key(0)).actor
     actor = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes)
     actor["params"]["Dense_1"]["bias"] = jnp.array([0.5, -1.0, np.log(0.1), np.log(2.0)])  # means, and logarithms of the deviations
-    key = jax.random.key(1)
-    mode, sampled = (agents.select_action(key, actor, jnp.ones((3, 3)), CONFIG, action_dim=2, stochastic=stochastic) for stochastic in (False, True))
+    mode, sampled = (
+        agents.select_action(jax.random.key(1), actor, jnp.ones((3, 3)), CONFIG, action_dim=2, stochastic=stochastic) for stochastic in (False, True)
+    )
     np.testing.assert_allclose(mode, np.tanh([[0.5, -1.0]] * 3), atol=1e-6)
-    noise = np.asarray(jax.random.normal(key, (2, 3))).T  # one column per row of the batch
+    noise = np.asarray(jax.random.normal(jax.random.key(1), (2, 3))).T  # one column per row of the batch
     np.testing.assert_allclose(sampled, np.tanh([0.5, -1.0] + np.array([0.1, 2.0]) * noise), atol=1e-6)
 
 
