@@ -67,7 +67,7 @@ def reset(
     key_env, key_goal = jax.random.split(key)
     env_state, observation = jax.vmap(env.reset)(jax.random.split(key_env, num_envs))
     if starts is not None:
-        key_choice, key_start, key_states = jax.random.split(jax.random.fold_in(key, 1), 3)
+        key_choice, key_start, key_states = jax.random.split(jax.random.fold_in(key, 2), 3)  # 2: split has used what 0 and 1 give
         vectors = starts.states[uniform_index(key_start, (num_envs,), starts.count)]
         demonstrated = jax.vmap(env.vector_to_state)(jax.random.split(key_states, num_envs), vectors)
         chosen = jax.random.bernoulli(key_choice, demo_reset_ratio, (num_envs,))

@@ -41,7 +41,7 @@ class Episodes:
     lengths: Array  # (N,) int32, number of transitions, 1 <= length <= T
     terminated: Array  # (N,) bool, whether the last transition ended the task (rather than the horizon)
     desired_goals: Array  # (N, G) float32, the goal that the episode was acted under
-    states: Array | None = None  # (N, T + 1, S) environment states as vectors, repeated after the end; None where they are not kept
+    states: Array | None = None  # (N, T + 1, S) environment states as vectors; None where they are not kept
 
 
 @struct.dataclass(kw_only=True)
