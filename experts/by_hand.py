@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any, get_args
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from envs.reach import panda
@@ -142,11 +143,4 @@ def command_of(device: Any) -> np.ndarray | None:
         return None
     roll, pitch, yaw = given["raw_drotation"]
     translation, rotation = device._postprocess_device_outputs(np.asarray(given["dpos"], float), np.array([pitch, roll, -yaw]))
-    return np.concatenate(
-        [_shortened(FULL_TRANSLATION * translation, panda.MAX_TRANSLATION), _shortened(FULL_ROTATION * rotation, panda.MAX_ROTATION)]
-    ).astype(np.float32)
-
-
-def _shortened(vector: np.ndarray, limit: float) -> np.ndarray:
-    length = np.linalg.norm(vector)
-    return vector * (limit / length) if length > limit else vector
+    return np.asarray(panda.shortened_command(jnp.asarray([*FULL_TRANSLATION * translation, *FULL_ROTATION * rotation], jnp.float32)))

@@ -38,10 +38,6 @@ class ReachExpert:
           (6,) displacement in m and rotation vector in rad.
         """
         arm = panda.posture(state.joints)
-        next_one = (jnp.arange(env.num_waypoints) == jnp.minimum(state.num_reached, env.num_waypoints - 1)).astype(jnp.float32)
-        position = jnp.sum(next_one[:, None] * state.positions, axis=0)
-        rotation = jnp.sum(next_one[:, None, None] * state.rotations, axis=0)
-        noise = self.randomness_scale * jax.random.normal(key, (6,))
-        translation = panda.shortened(position - arm.hand_position + noise[:3], panda.MAX_TRANSLATION)
-        turn = panda.shortened(rotations.between(arm.hand_rotation, rotation) + noise[3:], panda.MAX_ROTATION)
-        return jnp.concatenate([translation, turn])
+        position, rotation = env.next_waypoint(state)
+        towards = jnp.concatenate([position - arm.hand_position, rotations.between(arm.hand_rotation, rotation)])
+        return panda.shortened_command(towards + self.randomness_scale * jax.random.normal(key, (6,)))

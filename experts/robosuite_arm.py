@@ -29,7 +29,7 @@ import numpy as np
 from envs.reach import panda
 from envs.reach.parameterized_reach import FixedParameterizedReach, ParameterizedReach, ReachState
 from experts.recording import Recording
-from hindrl_jax.errors import UserError
+from hindrl_jax.errors import UserError, one_line
 from hindrl_jax.types import Array, Episodes, TimeStep, action_from_env
 
 ReachEnvironment = FixedParameterizedReach | ParameterizedReach
@@ -89,18 +89,14 @@ def import_robosuite() -> ModuleType:
             return importlib.import_module("robosuite")
     except ImportError as error:
         if ".so" in str(error):
-            raise UserError(f"robosuite lacks a system library ({_one_line(error)}): on Debian, apt-get install libgl1 libglib2.0-0") from error
-        raise UserError(f"robosuite cannot be imported ({_one_line(error)}): {INSTALL}") from error
+            raise UserError(f"robosuite lacks a system library ({one_line(error)}): on Debian, apt-get install libgl1 libglib2.0-0") from error
+        raise UserError(f"robosuite cannot be imported ({one_line(error)}): {INSTALL}") from error
     finally:
         # robosuite decides for the whole process how MuJoCo draws, but it is not the only one here that draws.
         if drawing_with is None:
             os.environ.pop("MUJOCO_GL", None)
         else:
             os.environ["MUJOCO_GL"] = drawing_with
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())
 
 
 # ----------------------------------------------------------------------------------------------------------------------- the environment
@@ -259,7 +255,7 @@ class RobosuiteArm:
                 self.environment = environment(num_waypoints, **tolerances, **window)
         except (OSError, ValueError) as error:
             raise UserError(
-                f"robosuite cannot build its scene ({_one_line(error)}): files of it are missing or damaged, "
+                f"robosuite cannot build its scene ({one_line(error)}): files of it are missing or damaged, "
                 f"pip install --force-reinstall --no-deps robosuite=={ROBOSUITE_VERSION}"
             ) from error
 
@@ -297,7 +293,7 @@ class RobosuiteArm:
         try:
             self.environment.viewer.update()
         except RuntimeError as error:  # on macOS
-            raise UserError(f"the window cannot be opened ({_one_line(error)})") from error
+            raise UserError(f"the window cannot be opened ({one_line(error)})") from error
         self._undo_shortcuts()
 
     def is_open(self) -> bool:
@@ -466,9 +462,9 @@ def open_device(name: DeviceName, arm: RobosuiteArm) -> Any:
             devices = importlib.import_module("robosuite.devices")
             device = devices.Keyboard if name == "keyboard" else importlib.import_module("robosuite.devices.spacemouse").SpaceMouse
     except ImportError as error:
-        raise UserError(f"the {name} cannot be used ({_one_line(error)}): pip install hidapi, and libhidapi-hidraw0 on Debian") from error
+        raise UserError(f"the {name} cannot be used ({one_line(error)}): pip install hidapi, and libhidapi-hidraw0 on Debian") from error
     try:
         with _quiet():
             return device(env=arm.environment)
     except OSError as error:
-        raise UserError(f"no SpaceMouse can be opened ({_one_line(error)}): plug it in and see that you may read it, or use the keyboard") from error
+        raise UserError(f"no SpaceMouse can be opened ({one_line(error)}): plug it in and see that you may read it, or use the keyboard") from error

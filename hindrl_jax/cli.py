@@ -29,8 +29,8 @@ from experts.recording import Recording, on_host
 from experts.robosuite_arm import DeviceName
 from hindrl_jax import STARTED, __version__
 from hindrl_jax.config import SWEEPABLE, TrainConfig, without_effect
-from hindrl_jax.datasets import describe_demonstrations, load_demonstrations, read_states, save_demonstrations
-from hindrl_jax.errors import UserError
+from hindrl_jax.datasets import DemonstrationSummary, describe_demonstrations, load_demonstrations, read_states, save_demonstrations
+from hindrl_jax.errors import UserError, one_line
 from hindrl_jax.experiment import Result, check_trainable, fit, record_demonstrations
 from hindrl_jax.goals import epsilon_filter, epsilon_from_demonstrations, goal_table
 from hindrl_jax.plots import save_filter
@@ -491,9 +491,7 @@ class Info:
 def _demos_info(arguments: list[str]) -> None:
     """Say what a file of demonstrations holds."""
     options = _parse(Info, arguments, "hindrl demos info")
-    env, episodes, epsilon = _with_epsilon(options.file, m=options.m, k=options.k)
-    summary = describe_demonstrations(options.file)
-    achieved, lengths = env.achieved_goal(jnp.asarray(episodes.observations)), jnp.asarray(episodes.lengths)
+    summary, achieved, lengths, epsilon = _with_epsilon(options.file, m=options.m, k=options.k)
     filtered = goal_table(achieved, lengths, epsilon, filtered=True)
     console.print(f"{options.file}: {summary.env_name}({', '.join(f'{name}={value}' for name, value in summary.env_kwargs.items())})")
     console.print(
@@ -535,36 +533,39 @@ def _demos_plot(arguments: list[str]) -> None:
     path = options.to or options.file.with_suffix(".png")
     if path.suffix != ".png":
         raise UserError(f"cannot draw {path.name}: the name must end in .png")
-    env, episodes, epsilon = _with_epsilon(options.file, m=options.m, k=options.k)
-    if not 0 <= options.demo < len(episodes.lengths):
-        raise UserError(f"{options.file} has no demonstration {options.demo}: choose one from 0 to {len(episodes.lengths) - 1}")
-    goals = env.achieved_goal(jnp.asarray(episodes.observations[options.demo, : episodes.lengths[options.demo] + 1]))
+    summary, achieved, lengths, epsilon = _with_epsilon(options.file, m=options.m, k=options.k)
+    _check_demo(options.demo, len(lengths), options.file)
+    goals = np.asarray(achieved[options.demo, : int(lengths[options.demo]) + 1])
     dims = options.dims or tuple(sorted(int(dim) for dim in np.argsort(-np.ptp(_continuous(goals), axis=0), kind="stable")[:2]))
-    if len(set(dims)) < 2 or not all(0 <= dim < env.goal_dim for dim in dims):
-        raise UserError(f"--dims {dims[0]} {dims[1]} is not usable: give two different numbers from 0 to {env.goal_dim - 1}")
+    if len(set(dims)) < 2 or not all(0 <= dim < goals.shape[1] for dim in dims):
+        raise UserError(f"--dims {dims[0]} {dims[1]} is not usable: give two different numbers from 0 to {goals.shape[1] - 1}")
     kept = np.asarray(epsilon_filter(goals, epsilon))
-    title = f"{env.name}, demonstration {options.demo}, m = {options.m}, k = {options.k:g}"
+    title = f"{summary.env_name}, demonstration {options.demo}, m = {options.m}, k = {options.k:g}"
     with disk_trouble(path):
-        save_filter(np.asarray(goals), kept, np.asarray(epsilon), path, dims=dims, title=title)
+        save_filter(goals, kept, np.asarray(epsilon), path, dims=dims, title=title)
     console.print(f"wrote {path}: the filter keeps {kept.sum()} of {len(kept)} goals")
 
 
-def _continuous(goals: Any) -> np.ndarray:
+def _continuous(goals: np.ndarray) -> np.ndarray:
     """The goals (T, G) without what only jumps between whole numbers, such as masks, unless there is nothing else."""
-    goals = np.asarray(goals)
     whole = (goals == np.round(goals)).all(axis=0)
     return goals if whole.all() else np.where(whole[None], 0.0, goals)
 
 
-def _with_epsilon(file: Path, *, m: int, k: float) -> tuple[RestorableEnvironment, Episodes, jax.Array]:
-    """The demonstrations of a file, their environment, and epsilon over all of them."""
+def _with_epsilon(file: Path, *, m: int, k: float) -> tuple[DemonstrationSummary, jax.Array, jax.Array, jax.Array]:
+    """What a file holds, the goals (N, T + 1, G) that its demonstrations achieved, their lengths (N,), and epsilon (G,) over all of them."""
     if m < 0 or k < 0:
         raise UserError(f"--m {m} --k {k} is not usable: both must be 0 or more")
     summary = describe_demonstrations(file)
     env = make(summary.env_name, **summary.env_kwargs)
     episodes = load_demonstrations(file, env)
-    achieved = env.achieved_goal(jnp.asarray(episodes.observations))
-    return env, episodes, epsilon_from_demonstrations(achieved, jnp.asarray(episodes.lengths), m=m, k=k)
+    achieved, lengths = env.achieved_goal(jnp.asarray(episodes.observations)), jnp.asarray(episodes.lengths)
+    return summary, achieved, lengths, epsilon_from_demonstrations(achieved, lengths, m=m, k=k)
+
+
+def _check_demo(demo: int, num_demos: int, file: Path) -> None:
+    if not 0 <= demo < num_demos:
+        raise UserError(f"{file} has no demonstration {demo}: choose one from 0 to {num_demos - 1}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -584,8 +585,7 @@ def _demos_render(arguments: list[str]) -> None:
     options = _parse(RenderDemo, arguments, "hindrl demos render")
     summary = describe_demonstrations(options.file)
     states = read_states(options.file)
-    if not 0 <= options.demo < len(states):
-        raise UserError(f"{options.file} has no demonstration {options.demo}: choose one from 0 to {len(states) - 1}")
+    _check_demo(options.demo, len(states), options.file)
     path = options.to or options.file.with_suffix(".gif")
     draw_episode(path, make(summary.env_name, **summary.env_kwargs), states[options.demo])
     console.print(f"wrote {path}: {len(states[options.demo]) - 1} steps")
@@ -702,7 +702,7 @@ def main(arguments: list[str] | None = None) -> None:
             command, rest = _find(arguments)
             command(rest)
     except UserError as error:
-        print(f"hindrl: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"hindrl: {one_line(error)}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print("hindrl: interrupted", file=sys.stderr)

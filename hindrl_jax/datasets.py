@@ -33,7 +33,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from hindrl_jax.errors import UserError
+from hindrl_jax.errors import UserError, one_line
 from hindrl_jax.types import Environment, Episodes
 
 FORMAT_VERSION = 1
@@ -170,7 +170,7 @@ def save_demonstrations(
         refuse_existing()  # somebody else may have been quicker
         os.replace(temporary, path)
     except OSError as error:
-        raise UserError(f"{path}: cannot be written ({_one_line(error)}); check the folder, its permissions and the free space") from error
+        raise UserError(f"{path}: cannot be written ({one_line(error)}); check the folder, its permissions and the free space") from error
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()
@@ -406,7 +406,7 @@ def _damage_reported(where: str, what: str) -> Iterator[None]:
     except UserError:
         raise
     except (OSError, KeyError, RuntimeError, TypeError, ValueError, MemoryError) as error:
-        raise UserError(f"{where}: {what} ({_one_line(error)}); fetch the file again or {_RECORD_AGAIN}") from error
+        raise UserError(f"{where}: {what} ({one_line(error)}); fetch the file again or {_RECORD_AGAIN}") from error
 
 
 def _plain(value: Any) -> Any:
@@ -417,7 +417,3 @@ def _plain(value: Any) -> Any:
 def _json_bytes(value: Any) -> np.bytes_:
     """JSON as a string of fixed length: on a damaged file, strings of variable length can crash the HDF5 library."""
     return np.bytes_(json.dumps(_plain(value)).encode())
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())

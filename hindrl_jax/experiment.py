@@ -202,6 +202,9 @@ def fit(
     if config.goal.misalign_demo_actions and int(tables.lengths.min()) < 2:
         raise UserError("misalign_demo_actions needs demonstrations of at least 2 steps: turn it off or record others")
 
+    if config.demo_reset_ratio == 0.0:
+        tables = tables.replace(states=None)  # nobody needs them on the devices
+
     started = time.perf_counter()
     programs = _Programs(env, configs, tables)
     seeds_on_devices, tables, values = spread((np.asarray(seeds, np.uint32), tables, programs.values), programs.mesh)
@@ -264,6 +267,8 @@ def _demonstrations_per_seed(demonstrations: Episodes | Sequence[Episodes], seed
                 f"demonstrations of shapes {table.observations.shape} and {table.actions.shape} do not fit {env.name}: it takes one or more, "
                 f"as many for each seed, with observations (N, {expected[0]}, {expected[1]}) and actions (N, {expected[2]}, {expected[3]})"
             )
+    if any(table.states is None for table in tables):
+        tables = [table.replace(states=None) for table in tables]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *jax.device_get(tables))
 
 

@@ -29,6 +29,7 @@ def save_curve(result: Result, path: Path) -> None:
     axes[1].set(ylim=(0, result.env.horizon * 1.05), ylabel="episode length, steps", xlabel=_x_label(result))
     axes[1].legend(loc="lower left", frameon=False)
     axes[0].set_title(_title(result), loc="left")
+    _mark_success(axes[0])
     _tidy(axes)
     figure.savefig(path, dpi=130)
     plt.close(figure)
@@ -47,6 +48,7 @@ def save_sweep(parts: Sequence[Result], labels: Sequence[str], path: Path) -> No
     axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize="small")
     seeds = f", mean of {len(parts[0].seeds)} seeds" if len(parts[0].seeds) > 1 else ""
     axis.set_title(_title(parts[0]) + seeds, loc="left")
+    _mark_success(axis)
     _tidy([axis])
     figure.savefig(path, dpi=130)
     plt.close(figure)
@@ -73,8 +75,7 @@ def save_filter(achieved_goals: np.ndarray, kept: np.ndarray, epsilon: np.ndarra
         axis.scatter(x[shown], y[shown], s=14, c=np.flatnonzero(shown), cmap="viridis", zorder=3)
         axis.set_title(f"{label}: {shown.sum()}", loc="left")
         axis.set(xlabel=f"goal dimension {dims[0]}", ylabel=f"goal dimension {dims[1]}")
-        axis.grid(alpha=0.25)
-        axis.spines[["top", "right"]].set_visible(False)
+    _tidy(axes)
     width, height = 2 * epsilon[list(dims)]
     for left, bottom in zip(x[kept] - width / 2, y[kept] - height / 2, strict=True):
         axes[1].add_patch(plt.Rectangle((left, bottom), width, height, facecolor=_SEED, edgecolor=_MEAN, alpha=0.25, linewidth=0.5, zorder=2))
@@ -99,10 +100,14 @@ def _curves(result: Result) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return table[:, 0, 0], table[:, :, 1], table[:, :, 2]
 
 
+def _mark_success(axis: Any) -> None:
+    """Prepares an axis that shows success."""
+    axis.axhline(95, color="0.6", linestyle=":", linewidth=1)
+    axis.set(ylim=(-3, 103), ylabel="success, %")
+
+
 def _tidy(axes: Sequence[Any]) -> None:
-    """What all pictures share; the first axis shows success."""
-    axes[0].axhline(95, color="0.6", linestyle=":", linewidth=1)
-    axes[0].set(ylim=(-3, 103), ylabel="success, %")
+    """What all pictures share."""
     for axis in axes:
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)

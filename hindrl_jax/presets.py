@@ -36,8 +36,7 @@ def preset(algo: Algorithm = "hindrl", name: Preset = "default", *, env: str = "
     for value, kind, known in ((algo, "algorithm", get_args(Algorithm)), (name, "preset", get_args(Preset))):
         if value not in known:
             raise UserError(f"unknown {kind} {value!r}{did_you_mean(value, known)}; choose one of {', '.join(known)}")
-    config = {"default": _default, "thesis": _thesis, "original": _original}[name](algo, task(env).family)
-    return config if algo == "bc" else _as_algorithm(config, algo)
+    return _as_algorithm({"default": _default, "thesis": _thesis, "original": _original}[name](algo, task(env).family), algo)
 
 
 def _as_algorithm(config: TrainConfig, algo: Algorithm) -> TrainConfig:

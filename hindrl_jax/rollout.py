@@ -72,7 +72,7 @@ def reset(
         demonstrated = jax.vmap(env.vector_to_state)(jax.random.split(key_states, num_envs), vectors)
         chosen = jax.random.bernoulli(key_choice, demo_reset_ratio, (num_envs,))
         env_state = tree_where(chosen, demonstrated, env_state)
-        observation = tree_where(chosen, jax.vmap(env.observe)(demonstrated), observation)
+        observation = jax.vmap(env.observe)(env_state)
     return RolloutState(env_state=env_state, observation=observation, desired_goal=sample_goals(key_goal, behavioural_goals, num_envs))
 
 

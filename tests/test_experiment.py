@@ -69,6 +69,13 @@ def test_a_run_is_as_long_as_asked_and_seeds_do_not_depend_on_each_other(demonst
         np.testing.assert_allclose(value, together.rows[1].metrics[name], rtol=1e-3, atol=1e-5, err_msg=name)
 
 
+def test_demonstrated_states_are_asked_for_only_where_they_are_used_and_then_for_every_seed(demonstrations):
+    tables = [demonstrations, demonstrations.replace(states=None)]
+    with pytest.raises(hindrl.UserError, match="needs the states"):
+        hindrl.fit(ENV, tables, dataclasses.replace(CONFIG, demo_reset_ratio=0.5), seeds=[3, 4])
+    assert hindrl.fit(ENV, tables, CONFIG, seeds=[3, 4]).env_steps == 60
+
+
 # Every sweepable field, with a value other than CONFIG's, in a config where each of them has a say.
 OTHER_VALUES = dict(
     union_sampling_ratio=0.9,

@@ -262,8 +262,7 @@ def joint_targets(joints: Array, rest: Array, command: Array, posture: Posture) 
     """
     j = jacobian(posture)
     gram = _product(j, j.T)
-    translation, rotation = shortened(command[:3], MAX_TRANSLATION), shortened(command[3:], MAX_ROTATION)
-    twist = jnp.concatenate([translation, rotation]) * (_COMMAND_GAIN / _INTEGRATION_TIME)
+    twist = shortened_command(command) * (_COMMAND_GAIN / _INTEGRATION_TIME)
     pull = jnp.asarray(_NULL_SPACE_GAINS) * (rest - joints)
     damped = inverse(gram + _DAMPING**2 * jnp.eye(6))
     undamped = inverse(gram + 1e-7 * jnp.eye(6))  # no more than keeps float32 from dividing by 0
@@ -353,5 +352,11 @@ def _times(a: Array, x: Array) -> Array:
     return sum(a[:, i] * x[i] for i in range(a.shape[1]))
 
 
+def shortened_command(command: Array) -> Array:
+    """A command (6,), its displacement shortened to 0.02 m and its rotation vector to 0.05 rad, as the controller does."""
+    return jnp.concatenate([shortened(command[:3], MAX_TRANSLATION), shortened(command[3:], MAX_ROTATION)])
+
+
 def shortened(vector: Array, limit: float) -> Array:
+    """A vector (n,), no longer than the limit."""
     return vector * jnp.minimum(1.0, limit / jnp.maximum(jnp.sqrt(jnp.sum(jnp.square(vector))), 1e-12))

@@ -166,12 +166,10 @@ class _Reach(abc.ABC):
         """
         state = state.replace(joints=joints, velocities=velocities, step=state.step + 1)
         arm = panda.posture(joints)
-        next_one = jnp.arange(self.num_waypoints) == state.num_reached
-        position = jnp.sum(jnp.where(next_one[:, None], state.positions, 0.0), axis=0)
-        rotation = jnp.sum(jnp.where(next_one[:, None, None], state.rotations, 0.0), axis=0)
+        position, rotation = self.next_waypoint(state)
         distance = jnp.sqrt(jnp.sum(jnp.square(position - arm.hand_position)))
         angle = jnp.sqrt(jnp.sum(jnp.square(rotations.between(arm.hand_rotation, rotation))))
-        reached = (distance < self.position_tolerance) & (angle < self.rotation_tolerance)
+        reached = (distance < self.position_tolerance) & (angle < self.rotation_tolerance) & ~self.is_solved(state)
         state = state.replace(num_reached=state.num_reached + reached)
         terminated = self.is_solved(state)
         return state, TimeStep(
@@ -180,6 +178,12 @@ class _Reach(abc.ABC):
             terminated=terminated,
             truncated=(state.step >= self.horizon) & ~terminated,
         )
+
+    def next_waypoint(self, state: ReachState) -> tuple[Array, Array]:
+        """Position (3,) and rotation matrix (3, 3) of the waypoint whose turn it is, or of the last one if all are reached."""
+        chosen = jnp.arange(self.num_waypoints) == jnp.minimum(state.num_reached, self.num_waypoints - 1)
+        position = jnp.sum(jnp.where(chosen[:, None], state.positions, 0.0), axis=0)
+        return position, jnp.sum(jnp.where(chosen[:, None, None], state.rotations, 0.0), axis=0)
 
     def is_solved(self, state: ReachState) -> Array:
         """() bool, whether the last waypoint has been reached."""
@@ -210,10 +214,10 @@ class _Reach(abc.ABC):
             step=counters[1].astype(jnp.int32),
         )
 
-    def _hand(self, arm: panda.Posture) -> Array:
-        """(pose_dim,) position and orientation of the hand."""
+    def _pose(self, position: Array, rotation: Array) -> Array:
+        """(pose_dim,) a position (3,) and a rotation matrix (3, 3) of the hand, as they are observed."""
         orientation = rotations.to_six_d if self.orientation == "six_d" else rotations.to_rotation_vector
-        return jnp.concatenate([arm.hand_position, orientation(arm.hand_rotation)])
+        return jnp.concatenate([position, orientation(rotation)])
 
     def _mask(self, state: ReachState) -> Array:
         """(K,) 1 for each waypoint that has been reached."""
@@ -253,11 +257,10 @@ class FixedParameterizedReach(_Reach):
     def task_goal(self) -> Array:
         """(G,) the last waypoint's pose, and a mask of ones."""
         positions, matrices = self._waypoints(jax.random.key(0))
-        orientation = rotations.to_six_d if self.orientation == "six_d" else rotations.to_rotation_vector
-        return jnp.concatenate([positions[-1], orientation(matrices[-1]), jnp.ones(self.num_waypoints)])
+        return jnp.concatenate([self._pose(positions[-1], matrices[-1]), jnp.ones(self.num_waypoints)])
 
     def _observe(self, state: ReachState, arm: panda.Posture) -> Array:
-        return jnp.concatenate([self._hand(arm), self._mask(state)])
+        return jnp.concatenate([self._pose(arm.hand_position, arm.hand_rotation), self._mask(state)])
 
     def _waypoints(self, key: Array) -> tuple[Array, Array]:
         del key
@@ -298,7 +301,7 @@ class ParameterizedReach(_Reach):
 
     def _observe(self, state: ReachState, arm: panda.Posture) -> Array:
         remaining = [state.positions - arm.hand_position[None], jax.vmap(rotations.between, (None, 0))(arm.hand_rotation, state.rotations)]
-        return jnp.concatenate([self._hand(arm), self._mask(state), jnp.concatenate(remaining, axis=1).reshape(-1)])
+        return jnp.concatenate([self._pose(arm.hand_position, arm.hand_rotation), self._mask(state), jnp.concatenate(remaining, axis=1).reshape(-1)])
 
     def _waypoints(self, key: Array) -> tuple[Array, Array]:
         return random_waypoints(key, self.num_waypoints)
