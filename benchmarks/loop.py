@@ -36,7 +36,7 @@ class Loop:
         self.num_seeds = num_seeds
         self._mesh = Mesh(np.asarray(jax.devices()[:num_devices]), ("seed",))
         self.env = hindrl_jax.make("FixedGridPickAndPlace")
-        demonstrations = hindrl_jax.record_demonstrations(self.env, 1).episodes
+        demonstrations = hindrl_jax.record_demonstrations(self.env, 1)
         demonstrations = jax.tree.map(lambda leaf: np.stack([leaf] * num_seeds), jax.device_get(demonstrations))
         demonstrations, seeds = spread((demonstrations, np.arange(num_seeds, dtype=np.uint32)), self._mesh)
         key = jax.jit(over_seeds(jax.random.key, self._mesh))(seeds)

@@ -33,7 +33,7 @@ def run(options: Options) -> list[Row]:
     rows = [{"what": "sample_batch", "strategy": strategy} | result for strategy, result in timing.take_turns(contestants, options.effort).items()]
 
     env = loop.env
-    demonstrations = hindrl_jax.record_demonstrations(env, max(NUM_DEMONSTRATIONS)).episodes
+    demonstrations = hindrl_jax.record_demonstrations(env, max(NUM_DEMONSTRATIONS))
     achieved = env.achieved_goal(demonstrations.observations)
     epsilon = goals.epsilon_from_demonstrations(achieved, demonstrations.lengths, m=5, k=0.0)
     contestants = {number: _filter(achieved[:number], epsilon) for number in NUM_DEMONSTRATIONS}

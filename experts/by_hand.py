@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.reach import panda
-from experts.recording import Recording, on_host
+from experts.recording import on_host
 from experts.robosuite_arm import DeviceName, ReachEnvironment, RobosuiteArm, open_device, play_episode, stacked
 from hindrl_jax.errors import UserError
-from hindrl_jax.types import Array
+from hindrl_jax.types import Array, Episodes
 
 FULL_TRANSLATION, FULL_ROTATION = 0.05, 0.5  # m and rad that robosuite's default controller makes of a device's 1
 CONTROLS = {
@@ -34,7 +34,7 @@ class _WindowClosed(Exception):
 
 def record_by_hand(
     key: Array, env: ReachEnvironment, device: DeviceName, num_demos: int, *, report: Callable[[str], None] = lambda line: None
-) -> Recording:
+) -> Episodes:
     """Records demonstrations that a person plays. Unsolved episodes are discarded.
 
     An episode begins with the first movement, runs at 20 Hz, and ends when the task is solved or the horizon reached: 300 steps are 15 seconds.
@@ -43,11 +43,11 @@ def record_by_hand(
       key: random key, of starts and waypoints.
       env: the task, with the robosuite back end.
       device: what to steer with.
-      num_demos: N, at least 1. Closing the window ends the recording early.
+      num_demos: N, at least 1. Closing the window, or Ctrl-C, ends the recording early.
       report: called with lines for the person: the controls, and what became of each episode.
 
     Returns:
-      N episodes, or fewer but at least one if the window was closed.
+      N episodes, or fewer but at least one if the person stopped early.
 
     Raises:
       UserError: if there is no screen, the device or robosuite are unusable, or nothing was recorded.
@@ -78,22 +78,22 @@ def record_with(
     *,
     report: Callable[[str], None] = lambda line: None,
     period: float = panda.CONTROL_PERIOD,
-) -> Recording:
+) -> Episodes:
     """`record_by_hand`, with an arm and a device that are open; `period` is the time between two steps in s."""
-    kept: list[Recording] = []
+    kept: list[Episodes] = []
     while len(kept) < num_demos:
         key, key_episode = jax.random.split(key)
         try:
             episode = play_episode(key_episode, env, arm, _Hand(arm, device, period))
         except _StartOver:
             report("discarded: started over")
-        except _WindowClosed:
+        except (_WindowClosed, KeyboardInterrupt):
             if not kept:
-                raise UserError("the window was closed before anything was recorded: solve at least one episode") from None
-            report(f"the window was closed after {len(kept)} of {num_demos} demonstrations")
+                raise UserError("stopped before anything was recorded: solve at least one episode") from None
+            report(f"stopped after {len(kept)} of {num_demos} demonstrations")
             break
         else:
-            length, solved = int(episode.episodes.lengths), bool(episode.episodes.terminated)
+            length, solved = int(episode.lengths), bool(episode.terminated)
             if solved:
                 kept.append(episode)
             outcome = f"demonstration {len(kept)} of {num_demos}: {length} steps" if solved else f"discarded: not solved within {length} steps"

@@ -9,7 +9,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
 from hindrl_jax.errors import UserError
 from hindrl_jax.types import Array, Episodes, RestorableEnvironment, action_from_env, compiler_options, tree_where
@@ -18,27 +17,19 @@ Expert = Any
 """A frozen dataclass with a method act(key, env, state) -> (A,) action in the environment's own units."""
 
 
-@struct.dataclass(kw_only=True)
-class Recording:
-    """Demonstrations with the environment states that they went through."""
-
-    episodes: Episodes  # N episodes, states included
-
-    @property
-    def states(self) -> Array:
-        """(N, T + 1, S) states as vectors, repeated after the end of an episode."""
-        return self.episodes.states
+Act = Callable[[Array, Any, Array], Array]
+"""(key, state, observation (D,)) -> action (A,) in the environment's own units."""
 
 
-def play(key: Array, env: RestorableEnvironment, act: Callable[[Array, Any, Array], Array], num_episodes: int) -> Recording:
-    """Plays episodes to their end, solved or not, and notes the states on the way.
+def play(key: Array, env: RestorableEnvironment, act: Act, num_episodes: int) -> Episodes:
+    """Plays episodes to their end, solved or not, and notes the states on the way, which are repeated after the end.
 
     The desired goal of an episode is the goal that it reached at its end.
 
     Args:
       key: random key.
       env: static.
-      act: (key, state, observation (D,)) -> action (A,) in the environment's own units.
+      act: the policy.
       num_episodes: N, played side by side.
     """
 
@@ -52,22 +43,20 @@ def play(key: Array, env: RestorableEnvironment, act: Callable[[Array, Any, Arra
         row = (observation, env.state_to_vector(state), action_from_env(action, env), time_step.reward, over, time_step.terminated)
         return (key, next_state, next_observation, over | time_step.terminated | time_step.truncated), row
 
-    def episode(key: Array) -> Recording:
+    def episode(key: Array) -> Episodes:
         key_reset, key_play = jax.random.split(key)
         state, observation = env.reset(key_reset)
         start = (key_play, state, observation, jnp.asarray(False))
         (_, state, observation, _), rows = jax.lax.scan(step, start, length=env.horizon)
         observations, states, actions, rewards, over, terminated = rows
-        return Recording(
-            episodes=Episodes(
-                observations=jnp.concatenate([observations, observation[None]]),
-                actions=actions,
-                rewards=jnp.where(over, 0.0, rewards),
-                lengths=jnp.sum(~over),
-                terminated=jnp.any(terminated & ~over),
-                desired_goals=env.achieved_goal(observation),
-                states=jnp.concatenate([states, env.state_to_vector(state)[None]]),
-            ),
+        return Episodes(
+            observations=jnp.concatenate([observations, observation[None]]),
+            actions=actions,
+            rewards=jnp.where(over, 0.0, rewards),
+            lengths=jnp.sum(~over),
+            terminated=jnp.any(terminated & ~over),
+            desired_goals=env.achieved_goal(observation),
+            states=jnp.concatenate([states, env.state_to_vector(state)[None]]),
         )
 
     return jax.vmap(episode)(jax.random.split(key, num_episodes))
@@ -78,8 +67,8 @@ def on_host(env: RestorableEnvironment) -> bool:
     return getattr(env, "backend", None) == "robosuite"
 
 
-def player(env: RestorableEnvironment, act: Callable[[Array, Any, Array], Array], num_episodes: int) -> Callable[[Array], Recording]:
-    """`play` as a program, key -> recording, on whatever simulates the environment. It is compiled once.
+def player(env: RestorableEnvironment, act: Act, num_episodes: int) -> Callable[[Array], Episodes]:
+    """`play` as a program, key -> episodes, on whatever simulates the environment. It is compiled once.
 
     Args:
       env, act, num_episodes: as for `play`.
@@ -95,12 +84,12 @@ def player(env: RestorableEnvironment, act: Callable[[Array, Any, Array], Array]
 
 
 @functools.cache
-def _expert_player(env: RestorableEnvironment, expert: Expert, num_episodes: int) -> Callable[[Array], Recording]:
+def _expert_player(env: RestorableEnvironment, expert: Expert, num_episodes: int) -> Callable[[Array], Episodes]:
     """`player` of an expert; cached because a run records for each of its seeds."""
     return player(env, lambda key, state, observation: expert.act(key, env, state), num_episodes)
 
 
-def record(key: Array, env: RestorableEnvironment, expert: Expert, num_demos: int, *, max_attempts: int | None = None) -> Recording:
+def record(key: Array, env: RestorableEnvironment, expert: Expert, num_demos: int, *, max_attempts: int | None = None) -> Episodes:
     """Records `num_demos` demonstrations that solve the task; unsolved episodes are discarded.
 
     Args:
@@ -118,15 +107,15 @@ def record(key: Array, env: RestorableEnvironment, expert: Expert, num_demos: in
     batch_size = 1 if on_host(env) else max(num_demos, 16)
     play_batch = _expert_player(env, expert, batch_size)
     kept, attempts = [], 0
-    while sum(len(batch.states) for batch in kept) < num_demos:
+    while sum(len(batch.lengths) for batch in kept) < num_demos:
         if attempts >= max_attempts:
-            found = sum(len(batch.states) for batch in kept)
+            found = sum(len(batch.lengths) for batch in kept)
             raise UserError(
                 f"the expert solved only {found} of {attempts} episodes of {env.name} within the horizon of {env.horizon} steps, "
                 f"but {num_demos} demonstrations are wanted: raise the horizon or ask for fewer"
             )
         key, key_batch = jax.random.split(key)
         batch = jax.device_get(play_batch(key_batch))
-        kept.append(jax.tree.map(lambda leaf, solved=batch.episodes.terminated: leaf[solved], batch))
+        kept.append(jax.tree.map(lambda leaf, solved=batch.terminated: leaf[solved], batch))
         attempts += batch_size
     return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)[:num_demos]), *kept)

@@ -28,7 +28,6 @@ import numpy as np
 
 from envs.reach import panda
 from envs.reach.parameterized_reach import FixedParameterizedReach, ParameterizedReach, ReachState
-from experts.recording import Recording
 from hindrl_jax.errors import UserError, one_line
 from hindrl_jax.types import Array, Episodes, TimeStep, action_from_env
 
@@ -38,7 +37,7 @@ Act = Callable[[Array, ReachState, Array], Array]
 DeviceName = Literal["keyboard", "spacemouse"]
 
 ROBOSUITE_VERSION, MUJOCO_SERIES = "1.5.1", "3.9"  # from MuJoCo 3.10 on, this robosuite fails to build any environment
-INSTALL = "pip install 'hindrl-jax[robosuite]'"
+INSTALL = f"{sys.executable} -m pip install robosuite=={ROBOSUITE_VERSION} 'mujoco=={MUJOCO_SERIES}.*'"
 _WAYPOINT_GREEN = (0.1, 0.8, 0.1)
 _LEAST_OPAQUE = 0.25
 _GRIPPER_CLOSED = 1.0
@@ -81,6 +80,7 @@ def import_robosuite() -> ModuleType:
       UserError: if it is missing, of another version, or cannot be imported.
     """
     check_versions()
+    panda.import_mujoco()
     # Its logger sets its own level while it is imported, and complains at once; to be disabled is all that lasts.
     logging.getLogger("robosuite_logs").disabled = True
     drawing_with = os.environ.get("MUJOCO_GL")
@@ -256,7 +256,7 @@ class RobosuiteArm:
         except (OSError, ValueError) as error:
             raise UserError(
                 f"robosuite cannot build its scene ({one_line(error)}): files of it are missing or damaged, "
-                f"pip install --force-reinstall --no-deps robosuite=={ROBOSUITE_VERSION}"
+                f"{sys.executable} -m pip install --force-reinstall --no-deps robosuite=={ROBOSUITE_VERSION}"
             ) from error
 
     def reset(self, joints: np.ndarray, positions: np.ndarray | None = None, rotations: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -328,7 +328,7 @@ def shared_arm(num_waypoints: int) -> RobosuiteArm:
 # --------------------------------------------------------------------------------------------------------------------------- playing in it
 
 
-def play_in_robosuite(key: Array, env: ReachEnvironment, act: Act, num_episodes: int) -> Recording:
+def play_in_robosuite(key: Array, env: ReachEnvironment, act: Act, num_episodes: int) -> Episodes:
     """`experts.recording.play`, with the arm in robosuite: equal keys give the same starts, waypoints and keys for `act`.
 
     One episode after the other, on the host. `act` is compiled once, however often this is called with it.
@@ -340,7 +340,7 @@ def play_in_robosuite(key: Array, env: ReachEnvironment, act: Act, num_episodes:
       num_episodes: N.
 
     Returns:
-      The recording. Past the end of an episode observations and states are repeated, as `play` does, and actions are 0.
+      N episodes. Past the end of an episode observations and states are repeated, as `play` does, and actions are 0.
 
     Raises:
       UserError: if robosuite is missing or unusable.
@@ -350,7 +350,7 @@ def play_in_robosuite(key: Array, env: ReachEnvironment, act: Act, num_episodes:
     return stacked(episodes)
 
 
-def play_episode(key: Array, env: ReachEnvironment, arm: RobosuiteArm, act: Act) -> Recording:
+def play_episode(key: Array, env: ReachEnvironment, arm: RobosuiteArm, act: Act) -> Episodes:
     """Plays one episode on the host.
 
     Args:
@@ -387,22 +387,20 @@ def play_episode(key: Array, env: ReachEnvironment, arm: RobosuiteArm, act: Act)
         array = np.stack(jax.device_get(rows))
         return np.concatenate([array, np.zeros((env.horizon - len(rows), *array.shape[1:]), array.dtype)])
 
-    return Recording(
-        episodes=Episodes(
-            observations=repeated(observations),
-            actions=padded(actions),
-            rewards=padded(rewards),
-            lengths=np.int32(len(actions)),
-            terminated=np.bool_(time_step.terminated),
-            desired_goals=np.asarray(env.achieved_goal(observation)),
-            states=repeated(states),
-        ),
+    return Episodes(
+        observations=repeated(observations),
+        actions=padded(actions),
+        rewards=padded(rewards),
+        lengths=np.int32(len(actions)),
+        terminated=np.bool_(time_step.terminated),
+        desired_goals=np.asarray(env.achieved_goal(observation)),
+        states=repeated(states),
     )
 
 
-def stacked(recordings: list[Recording]) -> Recording:
-    """Single episodes as one recording."""
-    return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *recordings)
+def stacked(episodes: list[Episodes]) -> Episodes:
+    """Single episodes as one table."""
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *episodes)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -455,8 +453,7 @@ def open_device(name: DeviceName, arm: RobosuiteArm) -> Any:
         with _quiet():
             importlib.import_module("pynput.keyboard")
     except ImportError as error:
-        reason = str(error).splitlines()[0]
-        raise UserError(f"keys cannot be read here ({reason}): pip install pynput, and on Linux use an X11 session") from error
+        raise UserError(f"keys cannot be read here ({one_line(error)}): pip install pynput, and on Linux use an X11 session") from error
     try:
         with _quiet():  # the Python package hid is imported by the module itself, and missed by printing
             devices = importlib.import_module("robosuite.devices")
@@ -467,4 +464,4 @@ def open_device(name: DeviceName, arm: RobosuiteArm) -> Any:
         with _quiet():
             return device(env=arm.environment)
     except OSError as error:
-        raise UserError(f"no SpaceMouse can be opened ({one_line(error)}): plug it in and see that you may read it, or use the keyboard") from error
+        raise UserError(f"the {name} cannot be opened ({one_line(error)}): is it plugged in, and may you read it?") from error

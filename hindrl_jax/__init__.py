@@ -3,7 +3,7 @@
     import hindrl_jax as hindrl
 
     env = hindrl.make("FixedGridPickAndPlace")
-    demonstrations = hindrl.record_demonstrations(env, num_demos=1).episodes
+    demonstrations = hindrl.record_demonstrations(env, num_demos=1)
     result = hindrl.fit(env, demonstrations, hindrl.preset("hindrl"), seeds=[0])
     print(result.final_success)
 

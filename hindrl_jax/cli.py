@@ -25,11 +25,11 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from experts.by_hand import record_by_hand
-from experts.recording import Recording, on_host
+from experts.recording import on_host
 from experts.robosuite_arm import DeviceName
 from hindrl_jax import STARTED, __version__
 from hindrl_jax.config import SWEEPABLE, TrainConfig, without_effect
-from hindrl_jax.datasets import DemonstrationSummary, describe_demonstrations, load_demonstrations, read_states, save_demonstrations
+from hindrl_jax.datasets import DemonstrationSummary, check_can_write, describe_demonstrations, load_demonstrations, read_states, save_demonstrations
 from hindrl_jax.errors import UserError, one_line
 from hindrl_jax.experiment import Result, check_trainable, fit, record_demonstrations
 from hindrl_jax.goals import epsilon_filter, epsilon_from_demonstrations, goal_table
@@ -91,7 +91,7 @@ def _train(arguments: list[str]) -> None:
             summary = writer.finish(result)
             console.print(_summary_table(summary))
             console.print(_speed_line(summary))
-            console.print(f"wrote {out}: config.json, metrics.csv, summary.json, curve.png, episode.gif, parameters.npz")
+            console.print(f"wrote {out}: {', '.join(writer.files())}")
 
 
 def _sweep(arguments: list[str]) -> None:
@@ -172,9 +172,7 @@ def _hosts(options: TrainOptions) -> Iterator[bool]:
     try:
         jax.distributed.initialize(coordinator, num_hosts, host)
     except (RuntimeError, ValueError) as error:
-        raise UserError(
-            f"cannot join the other hosts ({str(error).splitlines()[0]}): give --coordinator HOST:PORT --num-hosts N --host I on each"
-        ) from error
+        raise UserError(f"cannot join the other hosts ({one_line(error)}): give --coordinator HOST:PORT --num-hosts N --host I on each") from error
     yield jax.process_index() == 0
     jax.distributed.shutdown()  # waits for the others; so after a failure, which they must notice, it is left out
 
@@ -293,7 +291,7 @@ def _demonstrations(spec: RunSpec) -> list[Episodes]:
     if spec.demos == FROM_PYTHON:
         raise UserError("the demonstrations of this run were given from Python, not from a file: name others with --demos")
     if _is_number(spec.demos):
-        return [record_demonstrations(spec.env, int(spec.demos), seed=seed).episodes for seed in spec.seeds]
+        return [record_demonstrations(spec.env, int(spec.demos), seed=seed) for seed in spec.seeds]
     episodes = load_demonstrations(spec.demos, spec.env)
     solved = np.asarray(episodes.terminated)
     if not solved.any():
@@ -347,7 +345,7 @@ class Eval:
     episodes: int = 100
     """Episodes per seed."""
     seed: int = 0
-    """Which episodes: equal numbers give equal ones."""
+    """Which episodes: equal numbers give equal ones, in the same back end."""
     stochastic: bool = False
     """Sample the actions instead of taking the mean ones."""
     backend: str | None = None
@@ -446,32 +444,34 @@ def _demos_record(arguments: list[str]) -> None:
     parsed = _parse(namespace, arguments, "hindrl demos record", _demos_record.__doc__)
     options, env = parsed.options, parsed.environment
     _key(options.seed)
-    if options.out.exists() and not options.overwrite:
-        raise UserError(f"{options.out} already exists: choose another --out, or replace it with --overwrite")
+    check_can_write(options.out, overwrite=options.overwrite)
     if options.device is None:
         expert = dataclasses.asdict(parsed.expert)
         with console.status("recording") if on_host(env) else contextlib.nullcontext():  # it takes seconds for each episode
-            recording = record_demonstrations(env, options.demos, seed=options.seed, expert=parsed.expert)
+            demonstrations = record_demonstrations(env, options.demos, seed=options.seed, expert=parsed.expert)
     else:
+        if parsed.expert != entry.expert():
+            raise UserError(f"the expert's options are of no use when you play yourself with --device {options.device}: drop one or the other")
         expert = {"device": options.device}
-        env, recording = _record_by_hand(env, options)
+        env, demonstrations = _record_by_hand(env, options)
     save_demonstrations(
         options.out,
-        recording.episodes,
-        states=np.asarray(recording.states),
+        demonstrations,
         env=env,
         env_args=dataclasses.asdict(env),
         expert=expert,
         overwrite=options.overwrite,
     )
-    lengths = np.asarray(recording.episodes.lengths)
+    lengths = np.asarray(demonstrations.lengths)
     console.print(f"wrote {options.out}: {_count(len(lengths), 'demonstration')} of {env.name}, mean length {lengths.mean():.1f} steps")
 
 
-def _record_by_hand(env: RestorableEnvironment, options: Record) -> tuple[RestorableEnvironment, Recording]:
+def _record_by_hand(env: RestorableEnvironment, options: Record) -> tuple[RestorableEnvironment, Episodes]:
     """The environment in robosuite, and what a person did there."""
-    if "backend" not in (field.name for field in dataclasses.fields(env)):
+    if not hasattr(env, "backend"):
         raise UserError(f"--device {options.device} steers a robot's arm, and {env.name} has none: choose a reach environment, or drop --device")
+    if env.backend == "mjx":
+        raise UserError(f"--device {options.device} steers the arm of robosuite: drop --backend mjx, or drop --device")
     env = dataclasses.replace(env, backend="robosuite")
     return env, record_by_hand(_key(options.seed), env, options.device, options.demos, report=console.print)
 

@@ -34,7 +34,7 @@ import h5py
 import numpy as np
 
 from hindrl_jax.errors import UserError, one_line
-from hindrl_jax.types import Environment, Episodes
+from hindrl_jax.types import Episodes, RestorableEnvironment
 
 FORMAT_VERSION = 1
 _GYM_ENV_TYPE = 2
@@ -92,8 +92,7 @@ def save_demonstrations(
     path: str | os.PathLike[str],
     demonstrations: Episodes,
     *,
-    states: np.ndarray,
-    env: Environment,
+    env: RestorableEnvironment,
     env_args: dict[str, Any],
     expert: dict[str, Any] | None = None,
     overwrite: bool = False,
@@ -104,8 +103,7 @@ def save_demonstrations(
 
     Args:
       path: the file to write; missing folders are made.
-      demonstrations: a table of N episodes, as NumPy or JAX arrays.
-      states: (N, T + 1, S) flat simulator states along each episode, for rendering.
+      demonstrations: a table of N episodes with their states, as NumPy or JAX arrays.
       env: the environment that the demonstrations were recorded in.
       env_args: arguments that build this environment again, usually `dataclasses.asdict(env)`; must be convertible to JSON.
       expert: name and settings of the expert, for the record; must be convertible to JSON.
@@ -113,15 +111,13 @@ def save_demonstrations(
 
     Raises:
       UserError: the file exists and `overwrite` is off, it cannot be written, or its content would be refused by `load_demonstrations`.
-      ValueError: `states` does not go with the table of episodes.
+      ValueError: the episodes have no states, or not those of the environment.
     """
     path = Path(path)
-    table = Episodes(
-        **{name: np.asarray(getattr(demonstrations, name)) for name in (field.name for field in dataclasses.fields(Episodes)) if name != "states"}
-    )
-    states = np.asarray(states)
-    if states.ndim != 3 or states.shape[:2] != table.observations.shape[:2]:
-        raise ValueError(f"states must have shape {(*table.observations.shape[:2], 'S')}, found {states.shape}")
+    table = Episodes(**{field.name: np.asarray(getattr(demonstrations, field.name)) for field in dataclasses.fields(Episodes)})
+    expected = (*table.observations.shape[:2], env.state_dim)
+    if np.shape(table.states) != expected:
+        raise ValueError(f"states must have shape {expected}, found {np.shape(table.states)}")
     achieved_goals = np.asarray(env.achieved_goal(table.observations))
 
     def write(file: h5py.File) -> None:
@@ -145,17 +141,11 @@ def save_demonstrations(
             demo["actions"] = table.actions[i, :length].astype(np.float32)
             demo["rewards"] = table.rewards[i, :length].astype(np.float32)
             demo["dones"] = (np.arange(length) == length - 1).astype(np.int64) * int(table.terminated[i])
-            demo["states"] = states[i, :length]
-            demo["final_state"] = states[i, length]
-
-    def refuse_existing() -> None:
-        if path.is_dir():
-            raise UserError(f"{path}: is a folder; name a file")
-        if path.exists() and not overwrite:
-            raise UserError(f"{path}: exists already; allow overwriting it or choose another name")
+            demo["states"] = table.states[i, :length]
+            demo["final_state"] = table.states[i, length]
 
     # The HDF5 library may crash the whole process when a disk is full, so it writes to memory, and plain Python writes the bytes.
-    refuse_existing()
+    check_can_write(path, overwrite=overwrite)
     content = io.BytesIO()
     with h5py.File(content, "w") as file:
         write(file)
@@ -167,7 +157,7 @@ def save_demonstrations(
             file.write(content.getbuffer())
             file.flush()
             os.fsync(file.fileno())  # else a power cut soon after the renaming could leave an empty file under the final name
-        refuse_existing()  # somebody else may have been quicker
+        check_can_write(path, overwrite=overwrite)  # somebody else may have been quicker
         os.replace(temporary, path)
     except OSError as error:
         raise UserError(f"{path}: cannot be written ({one_line(error)}); check the folder, its permissions and the free space") from error
@@ -176,7 +166,22 @@ def save_demonstrations(
             temporary.unlink()
 
 
-def load_demonstrations(path: str | os.PathLike[str], env: Environment, *, num_demos: int | None = None) -> Episodes:
+def check_can_write(path: Path, *, overwrite: bool) -> None:
+    """Makes sure, before any work is done, that demonstrations can be saved under this name.
+
+    Raises:
+      UserError: if not.
+    """
+    if path.is_dir():
+        raise UserError(f"{path}: is a folder; name a file")
+    if path.exists() and not overwrite:
+        raise UserError(f"{path}: exists already; allow overwriting it or choose another name")
+    existing = next(folder for folder in path.absolute().parents if folder.exists())
+    if not existing.is_dir() or not os.access(existing, os.W_OK):
+        raise UserError(f"{path}: cannot be written, since {existing} is {'read-only' if existing.is_dir() else 'a file'}; choose another place")
+
+
+def load_demonstrations(path: str | os.PathLike[str], env: RestorableEnvironment, *, num_demos: int | None = None) -> Episodes:
     """Reads demonstrations as a table padded with zeros to the horizon of `env`, NumPy arrays throughout.
 
     Demonstrations longer than the horizon are dropped with a warning. They stand in the numeric order of their names.
@@ -343,7 +348,7 @@ def _read_demonstration(path: Path, name: str, group: h5py.Group, length: int) -
     )
 
 
-def _check_against_env(path: Path, header: _Header, demos: list[_Demonstration], env: Environment) -> None:
+def _check_against_env(path: Path, header: _Header, demos: list[_Demonstration], env: RestorableEnvironment) -> None:
     if header.env_name != env.name:
         raise UserError(f"{path}: was recorded in {header.env_name}, not in {env.name}; name a file of {env.name} or train in {header.env_name}")
     if dataclasses.is_dataclass(env):
@@ -355,7 +360,7 @@ def _check_against_env(path: Path, header: _Header, demos: list[_Demonstration],
                 raise UserError(
                     f"{path}: was recorded with {field} = {there}, but {env.name} here has {field} = {here}; use equal arguments or {_RECORD_AGAIN}"
                 )
-    dims = {"observations": env.observation_dim, "actions": env.action_dim, "achieved_goals": env.goal_dim}
+    dims = {"observations": env.observation_dim, "actions": env.action_dim, "achieved_goals": env.goal_dim, "states": env.state_dim}
     for demo in demos:
         for what, dim in dims.items():
             if getattr(demo, what).shape[1] != dim:

@@ -10,5 +10,5 @@ class UserError(ValueError):
 
 
 def one_line(error: BaseException) -> str:
-    """The message of an exception, as part of one line."""
-    return " ".join(str(error).split())
+    """The message of an exception, or its name if it has none, as part of one line."""
+    return " ".join(str(error).split()) or type(error).__name__

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from experts.recording import Recording, on_host, record
+from experts.recording import on_host, record
 from hindrl_jax import train as training
 from hindrl_jax.agent import Metrics
 from hindrl_jax.config import SWEEPABLE, TrainConfig, sweepable_value, with_traced_values
@@ -141,7 +141,7 @@ class Result:
         )
 
 
-def record_demonstrations(env: RestorableEnvironment, num_demos: int, *, seed: int = 0, expert: Any = None) -> Recording:
+def record_demonstrations(env: RestorableEnvironment, num_demos: int, *, seed: int = 0, expert: Any = None) -> Episodes:
     """Records demonstrations with the task's own expert.
 
     Args:
@@ -267,6 +267,8 @@ def _demonstrations_per_seed(demonstrations: Episodes | Sequence[Episodes], seed
                 f"demonstrations of shapes {table.observations.shape} and {table.actions.shape} do not fit {env.name}: it takes one or more, "
                 f"as many for each seed, with observations (N, {expected[0]}, {expected[1]}) and actions (N, {expected[2]}, {expected[3]})"
             )
+        if table.states is not None and table.states.shape != (*table.observations.shape[:2], env.state_dim):
+            raise UserError(f"demonstrated states of shape {table.states.shape} are not those of {env.name}, which has {env.state_dim}: record again")
     if any(table.states is None for table in tables):
         tables = [table.replace(states=None) for table in tables]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *jax.device_get(tables))

@@ -17,6 +17,7 @@ import os
 import re
 import resource
 import sys
+import warnings
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -32,7 +33,7 @@ from hindrl_jax import plots, rollout
 from hindrl_jax import train as training
 from hindrl_jax.agent import InputScale
 from hindrl_jax.config import TrainConfig, with_values
-from hindrl_jax.errors import UserError
+from hindrl_jax.errors import UserError, one_line
 from hindrl_jax.experiment import Result, Row
 from hindrl_jax.goals import GoalTable, sample_goals
 from hindrl_jax.registry import checked, did_you_mean, make, viewer
@@ -105,7 +106,7 @@ def read_spec(path: Path) -> RunSpec:
     except FileNotFoundError:
         raise UserError(f"{path} does not exist: give the directory of a run, or its {CONFIG}") from None
     except (OSError, UnicodeDecodeError, ValueError) as error:
-        raise UserError(f"{path} cannot be read as JSON ({str(error).splitlines()[0]}): use a {CONFIG} that `hindrl train` wrote") from error
+        raise UserError(f"{path} cannot be read as JSON ({one_line(error)}): use a {CONFIG} that `hindrl train` wrote") from error
     return RunSpec.from_json(data, path)
 
 
@@ -183,7 +184,10 @@ class RunWriter:
         self.rows_written += len(rows)
 
     def finish(self, result: Result, *, film: bool = True) -> dict[str, Any]:
-        """Writes the parameters, the summary, the curve and (unless `film` is off) the film of an episode; returns the summary."""
+        """Writes the parameters, the summary, the curve and (unless `film` is off) the film of an episode; returns the summary.
+
+        A film that cannot be drawn, for want of OpenGL, is a warning: the run is worth more.
+        """
         self.report(result.rows)
         summary = summarise(result)
         with disk_trouble(self.path):
@@ -191,8 +195,15 @@ class RunWriter:
             _write_atomically(self.path / SUMMARY, json.dumps(summary, indent=2) + "\n")
             plots.save_curve(result, self.path / CURVE)
         if film:
-            load_run(self.path).render(self.path / EPISODE)
+            try:
+                load_run(self.path).render(self.path / EPISODE)
+            except UserError as error:
+                warnings.warn(f"no {EPISODE}: {error}", stacklevel=2)
         return summary
+
+    def files(self) -> list[str]:
+        """Names of what has been written."""
+        return [name for name in _FILES if (self.path / name).exists()]
 
 
 class SweepWriter:
@@ -308,7 +319,7 @@ class Run:
           UserError: if the task has no such back end.
         """
         env = self.spec.env
-        if "backend" not in (field.name for field in dataclasses.fields(env)):
+        if not hasattr(env, "backend"):
             raise UserError(f"{env.name} has one back end only: drop the choice of {backend!r}")
         return dataclasses.replace(self, spec=dataclasses.replace(self.spec, env=checked(lambda: dataclasses.replace(env, backend=backend))))
 
@@ -355,7 +366,7 @@ class Run:
         for i, key in enumerate(keys):
             play_episode = player(self.spec.env, self._act(i, stochastic=stochastic, any_goal=True), 1)
             for n, key_episode in enumerate(jax.random.split(key, episodes)):
-                outcome = play_episode(key_episode).episodes
+                outcome = play_episode(key_episode)
                 success[i, n], length[i, n] = outcome.terminated[0], outcome.lengths[0]
                 report(i * episodes + n + 1)
         return rollout.Evaluation(success=success, length=length)
@@ -391,10 +402,9 @@ class Run:
         if seed not in self.spec.seeds:
             raise UserError(f"{self.path} has no seed {seed}: choose one of {', '.join(map(str, self.spec.seeds))}")
         act = self._act(self.spec.seeds.index(seed), stochastic=stochastic, any_goal=False)
-        recording = player(env, act, 1)(jax.random.key(0) if key is None else key)
-        episode = jax.tree.map(lambda leaf: leaf[0], recording)
-        draw_episode(path, env, np.asarray(episode.states[: int(episode.episodes.lengths) + 1]))
-        return bool(episode.episodes.terminated)
+        episodes = player(env, act, 1)(jax.random.key(0) if key is None else key)
+        draw_episode(path, env, np.asarray(episodes.states[0, : int(episodes.lengths[0]) + 1]))
+        return bool(episodes.terminated[0])
 
 
 def draw_episode(path: Path, env: RestorableEnvironment, states: np.ndarray) -> None:
@@ -449,7 +459,7 @@ def load_run(path: str | os.PathLike[str]) -> Run:
         scale = _input_scale(tree["input_scale"])
         policies = tree["policy"]
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise UserError(f"{file} is damaged ({str(error).splitlines()[0]}): train again") from error
+        raise UserError(f"{file} is damaged ({one_line(error)}): train again") from error
     return Run(path=path, spec=spec, policies=policies, behavioural_goals=goals, scale=scale)
 
 

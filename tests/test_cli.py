@@ -259,7 +259,7 @@ def test_bad_demonstration_files_are_refused(demos_file, tmp_path, capsys):
     cli.main(["demos", "record", "--env", "GridPickAndPlace", "--demos", "1", "--out", str(other)])
     assert "GridPickAndPlace" in refusal(capsys, "train", "--env", "FixedGridPickAndPlace", "--demos", other)
     assert "num_objects" in refusal(capsys, "train", "--env", "GridPickAndPlace", "--num-objects", 3, "--demos", other)
-    assert "already exists" in refusal(capsys, "demos", "record", "--demos", 1, "--out", other)
+    assert "exists already" in refusal(capsys, "demos", "record", "--demos", 1, "--out", other)
     text = tmp_path / "text.hdf5"
     text.write_text("not a file of numbers")
     refusal(capsys, "train", "--demos", text)

@@ -31,6 +31,7 @@ class LineWorld:
     observation_dim: int = 3
     goal_dim: int = 1
     action_dim: int = 2
+    state_dim: int = 2
 
     def achieved_goal(self, observation):
         return observation[..., :1]
@@ -43,7 +44,7 @@ def encoded_episodes(lengths, horizon=6, terminated=None):
     observations = np.stack([100 * episode + time, episode, time * np.ones_like(episode)], axis=-1).astype(np.float32)
     actions = np.stack([episode[:, :-1] / 100, time[:-1] / 100 * np.ones_like(episode[:, :-1])], axis=-1).astype(np.float32)
     rewards = (episode[:, :-1] + time[:-1] / 10).astype(np.float32)
-    states = np.stack([episode, time * np.ones_like(episode)], axis=-1).astype(np.int32)
+    states = np.stack([episode, time * np.ones_like(episode)], axis=-1).astype(np.float32)
     for i, length in enumerate(lengths):
         observations[i, length + 1 :] = np.nan
         actions[i, length:] = np.nan
@@ -58,19 +59,18 @@ def encoded_episodes(lengths, horizon=6, terminated=None):
         lengths=np.array(lengths, np.int32),
         terminated=np.array(terminated),
         desired_goals=desired_goals,
-        states=np.where(time[None, :, None] <= np.array(lengths)[:, None, None], states, np.nan),
+        states=np.where(time[None, :, None] <= np.array(lengths)[:, None, None], states, np.float32(np.nan)),
     )
-    return table, states
+    return table
 
 
 def save(path, lengths=(3, 6, 1), env=None, horizon=6, overwrite=False, **changes):
     """Saves the encoded episodes, with fields replaced by `changes`."""
     env = env or LineWorld()
-    table, states = encoded_episodes(lengths, horizon)
+    table = encoded_episodes(lengths, horizon)
     save_demonstrations(
         path,
         table.replace(**changes),
-        states=states,
         env=env,
         env_args=dataclasses.asdict(env),
         expert={"name": "scripted"},
@@ -100,11 +100,11 @@ def assert_refused(call, *words):
 @hypothesis.settings(max_examples=15, deadline=None)
 def test_what_is_saved_is_loaded(lengths, data):
     terminated = data.draw(st.lists(st.booleans(), min_size=len(lengths), max_size=len(lengths)))
-    table, states = encoded_episodes(lengths, terminated=terminated)
+    table = encoded_episodes(lengths, terminated=terminated)
     env = LineWorld()
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "demos.hdf5"
-        save_demonstrations(file, table, states=states, env=env, env_args=dataclasses.asdict(env))
+        save_demonstrations(file, table, env=env, env_args=dataclasses.asdict(env))
         loaded, loaded_states = load_demonstrations(file, env), read_states(file)
     # Padding is NaN in what was saved and zero in what is loaded, and the numbers are exact.
     for field in dataclasses.fields(Episodes):
@@ -114,8 +114,7 @@ def test_what_is_saved_is_loaded(lengths, data):
         assert value.dtype == {"lengths": np.int32, "terminated": bool}.get(field.name, np.float32)
     assert len(loaded_states) == len(lengths)
     for i, length in enumerate(lengths):
-        np.testing.assert_array_equal(loaded_states[i], states[i, : length + 1])
-        assert loaded_states[i].dtype == np.int32
+        np.testing.assert_array_equal(loaded_states[i], table.states[i, : length + 1])
 
 
 def test_layout_is_that_of_robomimic(path):
@@ -439,14 +438,15 @@ def test_what_could_not_be_loaded_is_not_saved(tmp_path, changes, words):
 
 
 def test_arguments_of_another_environment_are_not_saved(tmp_path):
-    table, states = encoded_episodes([2])
+    table = encoded_episodes([2])
     env_args = dataclasses.asdict(LineWorld(size=1.0))
     with pytest.raises(UserError, match=r"size = 1\.0"):
-        save_demonstrations(tmp_path / "demos.hdf5", table, states=states, env=LineWorld(), env_args=env_args)
+        save_demonstrations(tmp_path / "demos.hdf5", table, env=LineWorld(), env_args=env_args)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_states_must_go_with_the_episodes(tmp_path):
-    table, states = encoded_episodes([2, 3])
-    with pytest.raises(ValueError, match=r"states must have shape \(2, 7, 'S'\)"):
-        save_demonstrations(tmp_path / "demos.hdf5", table, states=states[:, :-1], env=LineWorld(), env_args={})
+    table = encoded_episodes([2, 3])
+    for states in (None, table.states[:, :-1], table.states[..., :-1]):
+        with pytest.raises(ValueError, match=r"states must have shape \(2, 7, 2\)"):
+            save_demonstrations(tmp_path / "demos.hdf5", table.replace(states=states), env=LineWorld(), env_args={})

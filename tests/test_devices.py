@@ -24,7 +24,7 @@ config = TrainConfig(
     steps=60, num_envs=2, updates_per_iteration=1, learning_starts=40, buffer_size=200, eval_every=20, eval_episodes=4,
     batch=BatchConfig(batch_size=8), agent=AgentConfig(net_arch=(4,), num_quantiles=3, top_quantiles_to_drop_per_net=1),
 )
-demonstrations = [hindrl.record_demonstrations(env, 1, seed=seed).episodes for seed in range(8)]
+demonstrations = [hindrl.record_demonstrations(env, 1, seed=seed) for seed in range(8)]
 configs = [dataclasses.replace(config, agent=dataclasses.replace(config.agent, learning_rate=rate)) for rate in (1e-3, 2e-3) for _ in range(4)]
 result = hindrl.fit(env, demonstrations, configs, seeds=range(8))
 leaves = jax.tree.leaves((result.state.agent, result.state.replay))

@@ -21,6 +21,7 @@ from hindrl_jax.types import Array
 @functools.cache
 def _mjx() -> Any:
     """The module, without the lines that it prints about an absent optional package."""
+    panda.import_mujoco()
     with contextlib.redirect_stdout(io.StringIO()):
         from mujoco import mjx
     return mjx

@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hindrl_jax.errors import UserError, one_line
 from hindrl_jax.types import Array
 
 MODEL_PATH = Path(__file__).with_name("panda.xml")
@@ -76,19 +77,30 @@ class Chain:
     upper: np.ndarray  # (7,) rad
 
 
+def import_mujoco() -> Any:
+    """MuJoCo's module, imported late, since it loads the OpenGL library that MUJOCO_GL names, which may be missing though nothing is drawn.
+
+    Raises:
+      UserError: if it does not load.
+    """
+    try:
+        import mujoco
+    except Exception as error:  # of many kinds, depending on the library
+        raise UserError(f"MuJoCo does not load ({one_line(error)}): install mujoco, and what MUJOCO_GL names or MUJOCO_GL=disable") from error
+    return mujoco
+
+
 @functools.cache
 def model() -> Any:
     """The compiled MuJoCo model of panda.xml."""
-    import mujoco
-
+    mujoco = import_mujoco()
     return mujoco.MjModel.from_xml_path(str(MODEL_PATH))
 
 
 @functools.cache
 def chain() -> Chain:
     """Reads the chain off the MuJoCo model, merging what is fixed to link 7 into it."""
-    import mujoco
-
+    mujoco = import_mujoco()
     m = model()
     data = mujoco.MjData(m)
     mujoco.mj_kinematics(m, data)

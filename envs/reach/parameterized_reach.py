@@ -6,7 +6,9 @@ and all waypoints before it have been reached. The reward is 1 when the last one
 Differences from the thesis:
   * Orientations are observed in the continuous 6-D form. The axis-angle of a hand that points down lies where it jumps from pi to -pi;
     `orientation="axis_angle"` gives it all the same.
-  * A rotation counts as reached by its angle, not by the distance between two axis-angle vectors, for the same reason.
+  * A rotation counts as reached by its angle, not by the distance between two axis-angle vectors, for the same reason (`rotation_test`).
+  * The joints vary at reset by 0.02 rad, as in the original code; in the text every episode starts from the same position (`joint_noise=0`).
+  * Commanded rotations are about the base's axes, as in robosuite's controller; the text has them relative to the hand's orientation.
   * The random task observes the waypoints, as the thesis says it must: for each, the displacement and the rotation that remain. Its achieved goal is
     the displacement and rotation that remain to the last waypoint, and the mask, so that equal goals mean the same in every episode.
 """
@@ -22,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs.reach import panda, rotations
+from envs.reach import mjx_dynamics, panda, rotations
 from hindrl_jax.checks import check, check_types
 from hindrl_jax.types import Array, TimeStep
 
@@ -72,6 +74,8 @@ class _Reach(abc.ABC):
     """Standard deviation in rad of the joints at reset; 0 starts every episode in the same place, as the thesis's text has it."""
     orientation: Literal["six_d", "axis_angle"] = "six_d"
     """How the hand's orientation is observed: two columns of its matrix, or the thesis's axis-angle, which jumps."""
+    rotation_test: Literal["angle", "axis_angle"] = "angle"
+    """What rotation_tolerance bounds: the angle between hand and waypoint, or the distance of their axis-angle vectors, as in the original code."""
     backend: Backend = "closed_form"
     """Who simulates the arm: closed_form (for bulk training), mjx (MuJoCo's own equations in JAX, some fifty times slower), or robosuite (one
     arm on the CPU, to record or to evaluate)."""
@@ -120,7 +124,8 @@ class _Reach(abc.ABC):
         """Starts an episode: key -> (state, observation (D,))."""
         key_episode, key_joints, key_waypoints = jax.random.split(key, 3)
         noise = self.joint_noise * jax.random.normal(key_joints, (panda.NUM_JOINTS,))
-        joints = jnp.asarray(panda.INITIAL_JOINTS, jnp.float32) + noise
+        lower, upper = (jnp.asarray(limit, jnp.float32) for limit in (panda.chain().lower, panda.chain().upper))
+        joints = jnp.clip(jnp.asarray(panda.INITIAL_JOINTS, jnp.float32) + noise, lower, upper)
         positions, rotation_matrices = self._waypoints(key_waypoints)
         state = ReachState(
             key=key_episode,
@@ -150,10 +155,7 @@ class _Reach(abc.ABC):
         """
         if self.backend == "robosuite":
             raise ValueError("robosuite simulates one arm outside JAX: record or evaluate with it, and train with closed_form or mjx")
-        if self.backend == "mjx":
-            from envs.reach.mjx_dynamics import control_step
-        else:
-            from envs.reach.panda import control_step
+        control_step = mjx_dynamics.control_step if self.backend == "mjx" else panda.control_step
         joints, velocities = control_step(state.joints, state.velocities, state.rest, jnp.clip(action, self.action_low, self.action_high))
         return self.arrive(state, joints, velocities)
 
@@ -167,8 +169,11 @@ class _Reach(abc.ABC):
         state = state.replace(joints=joints, velocities=velocities, step=state.step + 1)
         arm = panda.posture(joints)
         position, rotation = self.next_waypoint(state)
-        distance = jnp.sqrt(jnp.sum(jnp.square(position - arm.hand_position)))
-        angle = jnp.sqrt(jnp.sum(jnp.square(rotations.between(arm.hand_rotation, rotation))))
+        if self.rotation_test == "angle":
+            turn = rotations.between(arm.hand_rotation, rotation)
+        else:
+            turn = rotations.to_rotation_vector(rotation) - rotations.to_rotation_vector(arm.hand_rotation)
+        distance, angle = (jnp.sqrt(jnp.sum(jnp.square(vector))) for vector in (position - arm.hand_position, turn))
         reached = (distance < self.position_tolerance) & (angle < self.rotation_tolerance) & ~self.is_solved(state)
         state = state.replace(num_reached=state.num_reached + reached)
         terminated = self.is_solved(state)

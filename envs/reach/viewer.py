@@ -30,10 +30,7 @@ from envs.reach import panda
 from envs.reach.parameterized_reach import FixedParameterizedReach, ParameterizedReach, ReachState
 from hindrl_jax.errors import UserError
 
-try:
-    import mujoco
-except Exception as error:  # not only ImportError: it loads the OpenGL library that MUJOCO_GL names
-    raise UserError(f"cannot draw the arm, since MuJoCo does not load ({error}): install mujoco, and what MUJOCO_GL names") from error
+mujoco = panda.import_mujoco()
 
 _WIDTH, _HEIGHT = 480, 400  # pixels, without the caption
 _MAX_PICTURES = 160  # of one animation; of longer episodes every second state is shown, or every third, ...

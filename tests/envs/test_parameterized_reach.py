@@ -150,6 +150,15 @@ def test_without_noise_every_episode_starts_in_the_same_place():
     np.testing.assert_allclose(states.joints, np.tile(expected, (NUM_RESETS, 1)), rtol=1e-6)
 
 
+def test_starts_are_within_the_joint_limits():
+    env, chain = FixedParameterizedReach(joint_noise=1.0), panda.chain()
+    state, _ = compiled(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 50))
+    joints = np.asarray(state.joints)
+    assert (joints >= np.float32(chain.lower)).all()
+    assert (joints <= np.float32(chain.upper)).all()
+    assert ((joints == np.float32(chain.lower)) | (joints == np.float32(chain.upper))).any()
+
+
 def test_waypoints_of_the_fixed_task_are_the_thesis_s():
     states, _ = resets(FixedParameterizedReach())
     for positions, matrices in zip(np.asarray(states.positions)[:4], np.asarray(states.rotations), strict=False):
@@ -244,6 +253,24 @@ def test_tolerances(direction, tolerances, offset, turn, reached):
     env = FixedParameterizedReach(position_tolerance=tolerances[0], rotation_tolerance=tolerances[1])
     state, _ = stay(env, place([offset * direction, FAR], [turn * direction[::-1], (0, 0, 0)]))
     assert int(state.num_reached) == int(reached)
+
+
+@BOTH_TASKS
+def test_the_rotation_test_of_the_original_code_jumps(task):
+    """A hand that points down turns by pi about a horizontal axis: 0.02 rad about another one flips the sign of its axis-angle vector."""
+    _, matrix = mujoco_hand(panda.INITIAL_JOINTS)
+    by_vectors = task(num_waypoints=1, rotation_test="axis_angle")
+    reached = []
+    for angle in np.linspace(-0.045, 0.045, 7):
+        turn = angle * np.array([0.0, 1.0, 0.0])
+        state = place([(0.0, 0.0, 0.0)], [turn])
+        jump = np.linalg.norm(
+            Rotation.from_matrix(Rotation.from_rotvec(turn).as_matrix() @ matrix).as_rotvec() - Rotation.from_matrix(matrix).as_rotvec()
+        )
+        assert bool(stay(task(num_waypoints=1), state)[1].terminated)
+        assert bool(stay(by_vectors, state)[1].terminated) == (jump < 0.05)
+        reached.append(jump < 0.05)
+    assert len(set(reached)) == 2
 
 
 @BOTH_TASKS

@@ -22,13 +22,16 @@ LEFT, MIDDLE, RIGHT = (0.5, -0.25, 0.25), (0.6, 0.0, 0.35), (0.5, 0.28, 0.15)  #
 ROOT = Path(__file__).parent.parent.parent
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def opengl():
     """The pictures need an OpenGL library on the machine."""
     try:
         viewer._stage()
     except UserError as error:
         pytest.skip(str(error))
+
+
+needs_opengl = pytest.mark.usefixtures("opengl")
 
 
 def place(positions=(RIGHT, LEFT), *, joints=panda.INITIAL_JOINTS, num_reached=0, step=0):
@@ -62,6 +65,7 @@ def greenish(pixels):
     return int(np.sum(pixels[..., 1] > np.maximum(pixels[..., 0], pixels[..., 2]) + 15))
 
 
+@needs_opengl
 def test_the_size_of_a_picture_is_always_the_same():
     shapes = set()
     for env, state in [
@@ -76,6 +80,7 @@ def test_the_size_of_a_picture_is_always_the_same():
     assert len(shapes) == 1
 
 
+@needs_opengl
 def test_the_arm_moves_with_its_joints_and_the_waypoints_stay():
     env, state = FixedParameterizedReach(), place()
     before = viewer.frame(env, state)
@@ -89,6 +94,7 @@ def test_the_arm_moves_with_its_joints_and_the_waypoints_stay():
         np.testing.assert_allclose(viewer._stage().hand_position(joints), panda.posture(joints).hand_position, atol=1e-5)
 
 
+@needs_opengl
 @pytest.mark.parametrize("position", [LEFT, MIDDLE, RIGHT, (0.1, 0.3, 0.4)])
 def test_positions_are_drawn_where_their_pixel_is_said_to_be(position):
     stage, position = viewer._stage(), np.asarray(position)
@@ -100,6 +106,7 @@ def test_positions_are_drawn_where_their_pixel_is_said_to_be(position):
     np.testing.assert_allclose([columns.mean() + 0.5, rows.mean() + 0.5], stage.pixel(position), atol=0.7)
 
 
+@needs_opengl
 def test_waypoints_reached_next_and_later_look_different():
     env = ParameterizedReach(num_waypoints=3)
     state = place([LEFT, MIDDLE, RIGHT])
@@ -116,6 +123,7 @@ def test_waypoints_reached_next_and_later_look_different():
         assert full == [i == k for i in range(3)]
 
 
+@needs_opengl
 def test_numbers_tell_the_order():
     env, states = ParameterizedReach(), [place([LEFT, RIGHT]), place([RIGHT, LEFT])]
     first, second = (viewer.frame(env, state) for state in states)
@@ -124,6 +132,7 @@ def test_numbers_tell_the_order():
     assert label[0].tobytes() != label[1].tobytes()
 
 
+@needs_opengl
 @pytest.mark.parametrize("rotation", [DOWN, DOWN[:, [1, 0, 2]] * [1, -1, 1], np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])])
 def test_a_marker_lies_as_the_hand_would(rotation):
     stage, (x, y, z) = viewer._stage(), rotation.T
@@ -143,6 +152,7 @@ def test_a_marker_lies_as_the_hand_would(rotation):
     assert not drawn(-0.12 * z)
 
 
+@needs_opengl
 def test_the_hand_is_wide_along_its_y_axis_at_the_height_of_the_marker():
     model, joints = panda.model(), np.array(panda.INITIAL_JOINTS) + 0.1
     data = mujoco.MjData(model)
@@ -155,11 +165,13 @@ def test_the_hand_is_wide_along_its_y_axis_at_the_height_of_the_marker():
     np.testing.assert_allclose(data.geom_xpos[palm], hand.hand_position - viewer._HAND_TO_FINGERTIPS * hand.hand_rotation[:, 2], atol=1e-3)
 
 
+@needs_opengl
 def test_hundreds_of_waypoints_are_no_trouble():
     positions = np.random.default_rng(0).uniform((0.4, -0.3, 0.0), (0.6, 0.3, 0.4), (500, 3))
     viewer.frame(ParameterizedReach(num_waypoints=500), place(positions))
 
 
+@needs_opengl
 def test_the_caption_tells_step_progress_success_and_the_given_text():
     env, state = FixedParameterizedReach(), place(num_reached=1, step=3)
     caption = viewer.frame(env, state)[-drawing.CAPTION_HEIGHT :]
@@ -170,6 +182,7 @@ def test_the_caption_tells_step_progress_success_and_the_given_text():
     assert greenish(solved.astype(int)) > 0 == greenish(caption.astype(int))
 
 
+@needs_opengl
 def test_png_holds_the_frame(tmp_path):
     env, state = FixedParameterizedReach(), place()
     viewer.save_png(env, state, tmp_path / "state.png")
@@ -193,6 +206,7 @@ def read_gif(path):
     return pictures, durations
 
 
+@needs_opengl
 @pytest.mark.parametrize("stacked", [True, False])
 def test_gif_holds_every_state_in_order_at_its_time(tmp_path, stacked):
     env, states = FixedParameterizedReach(), episode(4)
@@ -232,6 +246,7 @@ def test_long_episodes_are_thinned_out_in_real_time(tmp_path, monkeypatch, lengt
     assert read_gif(tmp_path / "episode.gif")[1] == durations
 
 
+@needs_opengl
 def test_gif_shows_the_way_of_the_hand(tmp_path):
     env, states = FixedParameterizedReach(), episode(5)
     viewer.save_gif(env, states, tmp_path / "episode.gif", seconds_per_frame=0.2)
@@ -252,6 +267,7 @@ def test_gif_rejects_what_it_cannot_draw(tmp_path):
         viewer.save_gif(env, [place()], tmp_path / "x.gif", captions=["a", "b"])
 
 
+@needs_opengl
 def test_meshes_hang_on_the_same_bodies():
     model, bare = viewer._model(), panda.model()
     if importlib.util.find_spec("robosuite") is None:
@@ -265,6 +281,7 @@ def test_meshes_hang_on_the_same_bodies():
         np.testing.assert_array_equal(getattr(model, attribute), getattr(bare, attribute))
 
 
+@needs_opengl
 def test_without_robosuite_the_arm_wears_capsules(monkeypatch, tmp_path):
     monkeypatch.setattr(viewer.importlib.util, "find_spec", lambda name: None)
     assert viewer._model() is panda.model()
@@ -327,6 +344,7 @@ def test_choice_of_the_opengl_library(monkeypatch, egl, display, wish, expected)
     assert tried == [f"mujoco.{expected}"]
 
 
+@needs_opengl
 def test_a_process_that_has_drawn_ends_quietly():
     program = """
 import numpy as np

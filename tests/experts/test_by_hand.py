@@ -75,8 +75,8 @@ def test_reset_is_no_command():
 def played():
     """An episode of the expert, and the answers of a device that asks for the same."""
     episode = play_episode(jax.random.key(0), ENV, KinematicArm(), jax.jit(lambda key, state, observation: EXPERT.act(key, ENV, state)))
-    assert episode.episodes.terminated
-    actions = np.asarray(action_to_env(jnp.asarray(episode.episodes.actions[: int(episode.episodes.lengths)]), ENV))
+    assert episode.terminated
+    actions = np.asarray(action_to_env(jnp.asarray(episode.actions[: int(episode.lengths)]), ENV))
     x, y, z = actions[:, 3:].T / by_hand.FULL_ROTATION
     return episode, list(np.concatenate([actions[:, :3] / by_hand.FULL_TRANSLATION, np.stack([y, x, -z], axis=1)], axis=1))
 
@@ -87,7 +87,7 @@ def test_only_solved_episodes_are_kept_and_they_begin_with_the_first_movement(pl
     device = Device(*answers[:9], "reset", idle, idle, *answers, *[wrong] * ENV.horizon, idle, *answers)
     arm, lines = KinematicArm(), []
     recording = record_with(jax.random.key(1), ENV, arm, device, 2, report=lines.append, period=0.0)
-    length = int(episode.episodes.lengths)
+    length = int(episode.lengths)
     assert lines == [
         "discarded: started over",
         f"demonstration 1 of 2: {length} steps",
@@ -105,9 +105,22 @@ def test_closing_the_window_keeps_what_is_recorded(played):
     device, arm = Device(*answers), KinematicArm()
     arm.is_open = lambda: bool(device.answers)
     recording = record_with(jax.random.key(1), ENV, arm, device, 2, period=0.0)
-    assert recording.episodes.lengths.tolist() == [int(episode.episodes.lengths)]
+    assert recording.lengths.tolist() == [int(episode.lengths)]
     with pytest.raises(UserError, match="before anything was recorded"):
         record_with(jax.random.key(1), ENV, arm, Device(), 2, period=0.0)
+
+
+def test_so_does_an_interrupt(played):
+    episode, answers = played
+    device, arm = Device(*answers, np.ones(6)), KinematicArm()
+
+    def interrupted():
+        if len(device.answers) <= 1:
+            raise KeyboardInterrupt
+        return True
+
+    arm.is_open = interrupted
+    assert record_with(jax.random.key(1), ENV, arm, device, 2, period=0.0).lengths.tolist() == [int(episode.lengths)]
 
 
 def test_steps_keep_the_time():
@@ -141,7 +154,7 @@ def test_what_cannot_work_is_refused_at_once(changes, arguments, message, monkey
     [
         ("pynput.keyboard", ImportError("No module named 'pynput'"), "pip install pynput"),
         ("robosuite.devices.spacemouse", ImportError("Unable to load module hid"), "pip install hidapi"),
-        (None, OSError("open failed"), "plug it in"),
+        (None, OSError("open failed"), "plugged in"),
     ],
 )
 def test_devices_that_are_not_there_are_refused(missing, error, message, monkeypatch):

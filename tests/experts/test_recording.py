@@ -21,7 +21,7 @@ def recording():
 
 
 def test_every_demonstration_is_solved_and_rewarded_once_at_its_end(recording):
-    episodes = recording.episodes
+    episodes = recording
     lengths = np.asarray(episodes.lengths)
     assert len(lengths) == 20
     assert np.asarray(episodes.terminated).all()
@@ -33,7 +33,7 @@ def test_every_demonstration_is_solved_and_rewarded_once_at_its_end(recording):
 
 def test_playing_the_actions_from_the_states_gives_the_next_observations(recording):
     step = jax.jit(ENV.step)
-    episodes = recording.episodes
+    episodes = recording
     for n in range(5):
         for t in range(int(episodes.lengths[n])):
             state = ENV.vector_to_state(jax.random.key(0), recording.states[n, t])
@@ -45,21 +45,21 @@ def test_playing_the_actions_from_the_states_gives_the_next_observations(recordi
 
 
 def test_desired_goal_is_where_the_demonstration_ended(recording):
-    episodes = recording.episodes
+    episodes = recording
     last = np.asarray(episodes.observations)[np.arange(20), np.asarray(episodes.lengths)]
     np.testing.assert_array_equal(np.asarray(episodes.desired_goals), last)
     np.testing.assert_array_equal(last, np.tile(np.asarray(ENV.task_goal()), (20, 1)))
 
 
 def test_actions_are_in_the_policys_range(recording):
-    assert set(np.unique(recording.episodes.actions)) == {-1.0, 1.0}
+    assert set(np.unique(recording.actions)) == {-1.0, 1.0}
 
 
 def test_equal_keys_give_equal_demonstrations_and_others_differ(recording):
     again = record(jax.random.key(0), ENV, GridExpert(), 20)
-    np.testing.assert_array_equal(again.episodes.actions, recording.episodes.actions)
+    np.testing.assert_array_equal(again.actions, recording.actions)
     other = record(jax.random.key(1), ENV, GridExpert(), 20)
-    assert not np.array_equal(other.episodes.actions, recording.episodes.actions)
+    assert not np.array_equal(other.actions, recording.actions)
 
 
 def test_too_few_solved_episodes_is_an_error_that_says_so():
@@ -71,6 +71,6 @@ def test_too_few_solved_episodes_is_an_error_that_says_so():
 def test_unsolved_episodes_are_left_out():
     """With a horizon that the expert often misses, all that is kept is still solved."""
     short = dataclasses.replace(ENV, horizon=25)
-    episodes = record(jax.random.key(0), short, GridExpert(), 10).episodes
+    episodes = record(jax.random.key(0), short, GridExpert(), 10)
     assert np.asarray(episodes.terminated).all()
     assert (np.asarray(episodes.lengths) <= 25).all()

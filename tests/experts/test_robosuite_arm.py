@@ -32,6 +32,7 @@ from hindrl_jax.errors import UserError
 from hindrl_jax.experiment import fit
 from hindrl_jax.goals import GoalTable
 from hindrl_jax.runs import Run, RunSpec, load_run
+from hindrl_jax.train import make_policy
 from hindrl_jax.types import action_to_env
 
 ENV = FixedParameterizedReach(num_waypoints=2, backend="robosuite")
@@ -130,11 +131,11 @@ def test_host_loop_plays_as_the_compiled_one_does():
     expected = jax.jit(lambda key: play(key, env, act, 6), compiler_options=FAST_COMPILATION)(jax.random.key(4))
     arm, jitted = KinematicArm(), jax.jit(act, compiler_options=FAST_COMPILATION)
     found = stacked([play_episode(key_episode, env, arm, jitted) for key_episode in jax.random.split(jax.random.key(4), 6)])
-    lengths = np.asarray(expected.episodes.lengths)
-    assert set(np.asarray(expected.episodes.terminated).tolist()) == {False, True}
+    lengths = np.asarray(expected.lengths)
+    assert set(np.asarray(expected.terminated).tolist()) == {False, True}
     padding = np.arange(env.horizon)[None] >= lengths[:, None]
-    actions = jnp.where(padding[..., None], 0.0, expected.episodes.actions)
-    expected = expected.replace(episodes=expected.episodes.replace(actions=actions))
+    actions = jnp.where(padding[..., None], 0.0, expected.actions)
+    expected = expected.replace(actions=actions)
     assert jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), found) == jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), expected)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-4), found, expected)
 
@@ -161,22 +162,22 @@ def played(arm):
     """A solved episode of the expert in robosuite, and its spy."""
     spy = Spy(arm)
     episode = play_episode(jax.random.key(0), ENV, spy, jax.jit(expert_act(STEADY, ENV)))
-    assert episode.episodes.terminated
+    assert episode.terminated
     return episode, spy
 
 
 def test_robosuites_own_environment_agrees_about_rewards_and_progress(played):
     episode, spy = played
-    length = int(episode.episodes.lengths)
-    np.testing.assert_array_equal(spy.rewards, episode.episodes.rewards[:length])
+    length = int(episode.lengths)
+    np.testing.assert_array_equal(spy.rewards, episode.rewards[:length])
     assert np.flatnonzero(spy.rewards).tolist() == [length - 1]
-    np.testing.assert_array_equal(spy.reached, episode.episodes.observations[1 : length + 1, -2:])
+    np.testing.assert_array_equal(spy.reached, episode.observations[1 : length + 1, -2:])
 
 
 def test_an_episode_in_robosuite_reaches_the_same_waypoints_in_closed_form(played):
     episode, spy = played
-    length = int(episode.episodes.lengths)
-    actions = action_to_env(jnp.asarray(episode.episodes.actions), IN_CLOSED_FORM)
+    length = int(episode.lengths)
+    actions = action_to_env(jnp.asarray(episode.actions), IN_CLOSED_FORM)
     np.testing.assert_allclose(actions[:length], spy.commands, atol=1e-6)
     # An episode ends as soon as the hand is within the tolerance, so a hair's breadth more is granted to the replay.
     env = dataclasses.replace(IN_CLOSED_FORM, position_tolerance=0.0205, rotation_tolerance=0.054)
@@ -191,7 +192,7 @@ def test_actions_are_clipped_for_robosuite_and_recorded_as_they_are(arm):
     spy, env = Spy(arm), dataclasses.replace(ENV, horizon=2)
     episode = play_episode(jax.random.key(0), env, spy, lambda key, state, observation: 3.0 * jnp.asarray(env.action_high))
     np.testing.assert_allclose(spy.commands, np.tile(env.action_high, (2, 1)))
-    np.testing.assert_allclose(episode.episodes.actions, 3.0, rtol=1e-6)
+    np.testing.assert_allclose(episode.actions, 3.0, rtol=1e-6)
 
 
 @pytest.fixture(scope="module")
@@ -200,7 +201,7 @@ def recording(arm):
 
 
 def test_recording_keeps_solved_episodes_and_repeats_itself(recording):
-    episodes = recording.episodes
+    episodes = recording
     assert np.asarray(episodes.terminated).all()
     assert episodes.observations.shape == (2, COARSE.horizon + 1, COARSE.observation_dim)
     np.testing.assert_array_equal(episodes.rewards.sum(axis=1), 1.0)
@@ -217,7 +218,7 @@ def test_playing_compiles_once(arm):
 
     env = dataclasses.replace(COARSE, horizon=2)
     for seed in range(2):
-        assert play_in_robosuite(jax.random.key(seed), env, act, 2).episodes.lengths.tolist() == [2, 2]
+        assert play_in_robosuite(jax.random.key(seed), env, act, 2).lengths.tolist() == [2, 2]
     assert len(traces) == 1
 
 
@@ -225,7 +226,7 @@ def test_playing_compiles_once(arm):
 
 
 def save(path, recording, env):
-    save_demonstrations(path, recording.episodes, states=np.asarray(recording.states), env=env, env_args=dataclasses.asdict(env))
+    save_demonstrations(path, recording, env=env, env_args=dataclasses.asdict(env))
 
 
 def test_back_ends_share_their_files_and_nothing_else_may_differ(recording, tmp_path):
@@ -234,19 +235,20 @@ def test_back_ends_share_their_files_and_nothing_else_may_differ(recording, tmp_
         save(path, recording, dataclasses.replace(COARSE, backend=there))
         assert describe_demonstrations(path).env_kwargs["backend"] == there
         loaded = load_demonstrations(path, dataclasses.replace(COARSE, backend=here))
-        lengths = np.asarray(recording.episodes.lengths)
+        lengths = np.asarray(recording.lengths)
         np.testing.assert_array_equal(loaded.lengths, lengths)
         for n, length in enumerate(lengths):
-            np.testing.assert_array_equal(loaded.actions[n, :length], recording.episodes.actions[n, :length])
+            np.testing.assert_array_equal(loaded.actions[n, :length], recording.actions[n, :length])
     other = dataclasses.replace(COARSE, num_waypoints=2, backend="closed_form")
     with pytest.raises(UserError, match=r"recorded with num_waypoints = 1, but FixedParameterizedReach here has num_waypoints = 2; use equal"):
         load_demonstrations(path, other)
 
 
-def test_files_are_described_and_drawn_without_robosuite(recording, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(robosuite_arm, "import_robosuite", lambda: pytest.fail("robosuite was imported"))
+def test_files_are_described_and_drawn_without_robosuite(tmp_path, capsys, monkeypatch):
+    for name in ("import_robosuite", "environment_class", "shared_arm", "RobosuiteArm"):
+        monkeypatch.setattr(robosuite_arm, name, lambda *_, name=name: pytest.fail(f"{name} was called"))
     path = tmp_path / "demos.hdf5"
-    save(path, recording, COARSE)
+    save(path, record(jax.random.key(0), dataclasses.replace(COARSE, backend="closed_form"), STEADY, 2), COARSE)
     cli.main(["demos", "info", str(path)])
     printed = capsys.readouterr().out
     assert "2 demonstrations, 2 solved" in printed
@@ -296,12 +298,22 @@ def test_a_device_needs_a_robot(tmp_path, capsys):
     arguments = ["demos", "record", "--device", "keyboard", "--demos", "1", "--out", out]
     assert "GridPickAndPlace has none" in refusal(capsys, *arguments, "--env", "GridPickAndPlace")
     assert "invalid choice" in refusal(capsys, *arguments, "--env", COARSE.name, "--device", "joystick")
+    assert "drop --backend mjx" in refusal(capsys, *arguments, "--env", COARSE.name, "--backend", "mjx")
+    assert "expert's options" in refusal(capsys, *arguments, "--env", COARSE.name, "--randomness-scale", "0.05")
+
+
+def test_a_place_that_cannot_be_written_is_refused_before_anybody_plays(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(cli, "record_by_hand", lambda *_, **__: pytest.fail("somebody played for nothing"))
+    (tmp_path / "file").touch()
+    arguments = ["demos", "record", "--env", COARSE.name, "--device", "keyboard", "--demos", "1", "--overwrite", "--out"]
+    assert "is a folder" in refusal(capsys, *arguments, tmp_path)
+    assert "is a file; choose another place" in refusal(capsys, *arguments, tmp_path / "file" / "demos.hdf5")
 
 
 @pytest.fixture(scope="module")
 def run(arm, tmp_path_factory):
     """A run's directory with two policies that nobody trained."""
-    env = dataclasses.replace(COARSE, horizon=4, backend="closed_form")
+    env = dataclasses.replace(COARSE, horizon=4, joint_noise=0.0, backend="closed_form")
     config = TrainConfig(algo="bc", agent=AgentConfig(net_arch=(4,)))
     dims = dict(observation_dim=env.observation_dim, goal_dim=env.goal_dim, action_dim=env.action_dim)
     make_agents = jax.jit(jax.vmap(lambda key: agents.init(key, config.agent, **dims)), compiler_options=FAST_COMPILATION)
@@ -328,6 +340,38 @@ def test_evaluation_in_robosuite(run, capsys):
     outcomes = load_run(run).in_backend("robosuite").evaluate(episodes=2, report=played.append)
     assert outcomes == [{"seed": seed, "success": 0.0, "episode_length": 4.0} for seed in (0, 1)]
     assert played == [1, 2, 3, 4]
+
+
+def test_each_seed_plays_its_own_policy_towards_one_of_its_goals_per_episode(run, monkeypatch):
+    loaded = load_run(run)
+    goals = GoalTable(goals=jax.random.normal(jax.random.key(1), loaded.behavioural_goals.goals.shape), count=jnp.full(2, 3))
+    loaded = dataclasses.replace(loaded, behavioural_goals=goals).in_backend("robosuite")
+    env, config = loaded.spec.env, loaded.spec.config
+    acted = []
+
+    def stub_player(env, act, num_episodes):
+        def play_one(key):
+            state, observation = env.reset(key)
+            acted.append(np.stack([act(key_act, state, observation) for key_act in jax.random.split(key)]))
+            return SimpleNamespace(lengths=np.ones(num_episodes), terminated=np.ones(num_episodes, bool), observation=observation)
+
+        return play_one
+
+    monkeypatch.setattr(runs, "player", stub_player)
+    loaded.evaluate(episodes=4)
+    assert len(acted) == 8
+    observation = env.reset(jax.random.key(0))[1][None]
+    for seed in range(2):
+        actor, table, scale = jax.tree.map(lambda leaf, seed=seed: leaf[seed], (loaded.policies, loaded.behavioural_goals, loaded.scale))
+        policy = make_policy(actor, scale, env, config, stochastic=False)
+        possible = [np.asarray(action_to_env(policy(jax.random.key(0), observation, goal[None])[0], env)) for goal in table.goals]
+        chosen = set()
+        for actions in acted[4 * seed : 4 * seed + 4]:
+            np.testing.assert_array_equal(actions[0], actions[1])
+            distances = [np.abs(actions[0] - action).max() for action in possible]
+            assert min(distances) < 1e-6
+            chosen.add(int(np.argmin(distances)))
+        assert len(chosen) > 1
 
 
 def test_evaluation_counts_what_is_solved(run):
