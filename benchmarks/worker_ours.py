@@ -41,7 +41,7 @@ def update_alone(setting: Setting) -> Callable[[], None]:
     """`agent.update` on one batch that stays the same."""
     config, loop = setting.config.agent, Loop(setting.config)
     env = loop.env
-    schedule = agents.schedule(0.0, config, action_dim=env.action_dim)
+    schedule = agents.schedule(0.0, 0, config, action_dim=env.action_dim)
 
     @jax.jit
     def prepare(state: TrainState, data: Guidance) -> tuple[Transition, Array, Array]:

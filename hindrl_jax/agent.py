@@ -138,10 +138,20 @@ class Schedule:
 
     learning_rate: Array | float  # () step size of Adam
     target_entropy: Array | float  # () in nats
+    actor_average_rate: Array | float  # () share of the actor that moves into its running average
 
 
-def schedule(progress: Array | float, config: AgentConfig, *, action_dim: int) -> Schedule:
-    """The schedule when a share `progress` in [0, 1] of the run is over; both values move linearly."""
+def schedule(progress: Array | float, updates: Array | int, config: AgentConfig, *, action_dim: int) -> Schedule:
+    """What holds at one moment of a run.
+
+    Learning rate and target entropy move linearly. With a span s, the rate of the actor's average falls like 1 / (1 + s updates), the
+    polynomial-decay averaging of Shamir and Zhang (stochastic gradient descent for non-smooth optimization, 2013).
+
+    Args:
+      progress: share of the run that is over, in [0, 1].
+      updates: gradient steps so far.
+      config, action_dim: of the agent.
+    """
 
     def between(start: float, end: float | None) -> Array | float:
         return start if end is None else start + (end - start) * progress
@@ -150,6 +160,7 @@ def schedule(progress: Array | float, config: AgentConfig, *, action_dim: int) -
     return Schedule(
         learning_rate=between(config.learning_rate, config.final_learning_rate),
         target_entropy=between(entropy, config.final_target_entropy),
+        actor_average_rate=jnp.minimum(config.actor_average_rate, 1.0 / (1.0 + config.actor_average_span * updates)),
     )
 
 
@@ -283,7 +294,7 @@ def update(
 
     new_state = AgentState(
         actor=actor,
-        average_actor=optax.incremental_update(actor, state.average_actor, config.actor_average_rate),
+        average_actor=optax.incremental_update(actor, state.average_actor, schedule.actor_average_rate),
         critics=critics,
         target_critics=optax.incremental_update(critics, state.target_critics, config.target_update_rate),
         log_alpha=log_alpha,
@@ -308,7 +319,7 @@ def update_bc(state: AgentState, batch: Transition, *, inputs: Array, schedule: 
       state: the agent; only the actor and its optimiser change.
       batch: B demonstration transitions.
       inputs: (B, input_dim) network inputs.
-      schedule: its learning rate is used.
+      schedule: its learning rate and averaging rate are used.
       config: static.
 
     Returns:
@@ -321,5 +332,5 @@ def update_bc(state: AgentState, batch: Transition, *, inputs: Array, schedule: 
 
     value, gradient = jax.value_and_grad(loss)(state.actor)
     actor, actor_optimiser = _descend(gradient, state.actor_optimiser, state.actor, schedule.learning_rate)
-    average_actor = optax.incremental_update(actor, state.average_actor, config.actor_average_rate)
+    average_actor = optax.incremental_update(actor, state.average_actor, schedule.actor_average_rate)
     return state.replace(actor=actor, average_actor=average_actor, actor_optimiser=actor_optimiser), {"actor/bc_loss": value}

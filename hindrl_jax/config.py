@@ -125,6 +125,8 @@ class AgentConfig:
     """Share of the online critics that moves into the target critics at each gradient step (Polyak averaging)."""
     actor_average_rate: float = 0.002
     """Share of the actor that moves into its running average at each gradient step; evaluations and the saved policy use the average."""
+    actor_average_span: float = 0.0
+    """Share of the gradient steps so far that the average spans at least: it moves by at most 1 / (1 + span * steps), less and less."""
     initial_alpha: float = 0.002
     """Entropy coefficient at the start; it is tuned automatically from there."""
     target_entropy: float | None = -1.0
@@ -158,6 +160,7 @@ class AgentConfig:
             ),
             target_update_rate=(0.0 < self.target_update_rate <= 1.0, "in (0, 1]"),
             actor_average_rate=(0.0 < self.actor_average_rate <= 1.0, "in (0, 1]; 1 means no averaging"),
+            actor_average_span=(self.actor_average_span >= 0.0, "0 or more"),
             initial_alpha=(self.initial_alpha > 0.0, "greater than 0"),
             bc_weight=(self.bc_weight >= 0.0, "0 or more"),
         )
@@ -213,6 +216,7 @@ SWEEPABLE: dict[str, Literal["batch", "goal", "agent"]] = {
     "final_learning_rate": "agent",
     "target_update_rate": "agent",
     "actor_average_rate": "agent",
+    "actor_average_span": "agent",
     "initial_alpha": "agent",
     "target_entropy": "agent",
     "final_target_entropy": "agent",
@@ -228,7 +232,7 @@ def sweepable_value(config: TrainConfig, name: str) -> float | None:
 
 def without_effect(config: TrainConfig, name: str) -> str | None:
     """Why changing a field of `SWEEPABLE` would change nothing in this config, and what to do; None if it does have an effect."""
-    if config.algo == "bc" and name not in ("learning_rate", "final_learning_rate", "actor_average_rate"):
+    if config.algo == "bc" and name not in ("learning_rate", "final_learning_rate", "actor_average_rate", "actor_average_span"):
         return "behaviour cloning does not use it: choose another algo"
     relabelled = config.batch.num_sampled_goals > 0
     if name == "union_sampling_ratio" and not (relabelled and config.batch.hindrl_sampling_strategy == "joint_union"):

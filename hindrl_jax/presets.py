@@ -15,20 +15,21 @@ from typing import Any, Literal, get_args
 from hindrl_jax.config import AgentConfig, Algorithm, BatchConfig, GoalConfig, TrainConfig
 from hindrl_jax.errors import UserError
 from hindrl_jax.registry import Family, did_you_mean, task
+from hindrl_jax.types import Environment
 
 Preset = Literal["default", "thesis", "original"]
 
-ORIGINAL_RULES: dict[str, dict[str, Any]] = {"grid": {"strict_order": False}, "reach": {"orientation": "axis_angle"}}
+ORIGINAL_RULES: dict[str, dict[str, Any]] = {"grid": {"strict_order": False}, "reach": {"orientation": "axis_angle", "rotation_test": "axis_angle"}}
 """Per family of environments, the arguments under which the original code ran: the last object wins alone, orientations jump."""
 
 
-def preset(algo: Algorithm = "hindrl", name: Preset = "default", *, env: str = "FixedGridPickAndPlace") -> TrainConfig:
+def preset(algo: Algorithm = "hindrl", name: Preset = "default", *, env: str | Environment = "FixedGridPickAndPlace") -> TrainConfig:
     """The config of a model.
 
     Args:
       algo: "bc", "tqcfd", "hindrl" or "smooth-hindrl".
       name: "default", "thesis" or "original", see the module's docstring.
-      env: name of the environment that it is for.
+      env: what it is for: an environment, or its name.
 
     Raises:
       UserError: for a name that does not exist.
@@ -36,7 +37,8 @@ def preset(algo: Algorithm = "hindrl", name: Preset = "default", *, env: str = "
     for value, kind, known in ((algo, "algorithm", get_args(Algorithm)), (name, "preset", get_args(Preset))):
         if value not in known:
             raise UserError(f"unknown {kind} {value!r}{did_you_mean(value, known)}; choose one of {', '.join(known)}")
-    return _as_algorithm({"default": _default, "thesis": _thesis, "original": _original}[name](algo, task(env).family), algo)
+    family = task(env if isinstance(env, str) else env.name).family
+    return _as_algorithm({"default": _default, "thesis": _thesis, "original": _original}[name](algo, family), algo)
 
 
 def _as_algorithm(config: TrainConfig, algo: Algorithm) -> TrainConfig:
@@ -63,9 +65,9 @@ def _default(algo: Algorithm, family: Family) -> TrainConfig:
     if family == "grid":
         return TrainConfig()
     return TrainConfig(
-        steps=48_000,
+        steps=44_000,
         num_envs=16,
-        updates_per_iteration=16,
+        updates_per_iteration=32,
         learning_starts=4_800,
         demo_reset_ratio=0.75,
         eval_every=4_000,
@@ -74,10 +76,12 @@ def _default(algo: Algorithm, family: Family) -> TrainConfig:
         goal=GoalConfig(m=5, k=0.0),
         agent=AgentConfig(
             layer_norm=True,
+            learning_rate=3e-4,
             final_learning_rate=3e-5,
             clip_targets=True,
             target_update_rate=0.01,
-            actor_average_rate=0.0005,
+            actor_average_rate=1.0,
+            actor_average_span=0.5,
             bc_weight=0.03,
             input_encoding=encoding,
         ),
@@ -118,7 +122,7 @@ def _thesis(algo: Algorithm, family: Family) -> TrainConfig:
         ),
         goal=GoalConfig(m=5 if reach else 0, k=0.0),
         agent=AgentConfig(
-            net_arch=8 * (32,) if reach else 4 * (64,),
+            net_arch=8 * (32,) if reach else 4 * (64,),  # for reach the appendix prints seven layers, the code has eight
             layer_norm=False,
             learning_rate=1e-3,
             final_learning_rate=None,

@@ -198,16 +198,16 @@ def learn(state: TrainState, data: Guidance, *, env: Environment, config: TrainC
         num_updates = config.updates_per_iteration
         batches = jax.vmap(draw)(jax.random.split(key_batch, num_updates))
         progress = jnp.minimum(state.env_steps / config.steps, 1.0)
-        schedule = agents.schedule(progress, config.agent, action_dim=env.action_dim)
 
-        def gradient_step(carry: tuple[Array, AgentState], batch: Transition) -> tuple[tuple[Array, AgentState], Metrics]:
-            key, agent = carry
+        def gradient_step(carry: tuple[Array, AgentState], update: tuple[Array, Transition]) -> tuple[tuple[Array, AgentState], Metrics]:
+            (key, agent), (index, batch) = carry, update
             key, key_update = jax.random.split(key)
+            schedule = agents.schedule(progress, state.updates + index, config.agent, action_dim=env.action_dim)
             inputs = _network_inputs(batch, data.scale, env, config)
             agent, metrics = agents.update(key_update, agent, batch, **inputs, schedule=schedule, config=config.agent)
             return (key, agent), metrics
 
-        (_, agent), metrics = jax.lax.scan(gradient_step, (key_updates, state.agent), batches)
+        (_, agent), metrics = jax.lax.scan(gradient_step, (key_updates, state.agent), (jnp.arange(num_updates), batches))
         return state.replace(agent=agent, updates=state.updates + num_updates), jax.tree.map(jnp.mean, metrics)
 
     state, metrics = jax.lax.scan(iteration, state, length=num_iterations)
@@ -233,7 +233,7 @@ def clone(state: TrainState, data: Guidance, *, env: Environment, config: TrainC
             config=config.batch,
         )
         inputs = _network_inputs(batch, data.scale, env, config)["inputs"]
-        schedule = agents.schedule(jnp.minimum(state.updates / config.steps, 1.0), config.agent, action_dim=env.action_dim)
+        schedule = agents.schedule(jnp.minimum(state.updates / config.steps, 1.0), state.updates, config.agent, action_dim=env.action_dim)
         agent, metrics = agents.update_bc(state.agent, batch, inputs=inputs, schedule=schedule, config=config.agent)
         return state.replace(agent=agent, key=key, updates=state.updates + 1), metrics
 

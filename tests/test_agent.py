@@ -32,7 +32,7 @@ CONFIG = AgentConfig(
 )
 NUM_UPDATES = 400
 B = 32
-SCHEDULE = agents.schedule(0.0, CONFIG, action_dim=1)
+SCHEDULE = agents.schedule(0.0, 0, CONFIG, action_dim=1)
 
 
 def make_batch(*, action, reward, discount, observation=None, next_observation=None, is_demonstration=False):
@@ -72,7 +72,7 @@ def updates(key, start, batch, config):
     given = dict(
         inputs=inputs_of(batch.observation, config),
         next_inputs=inputs_of(batch.next_observation, config),
-        schedule=agents.schedule(0.0, config, action_dim=1),
+        schedule=agents.schedule(0.0, 0, config, action_dim=1),
     )
 
     def step(state, key):
@@ -210,7 +210,7 @@ def test_entropy_bonus_enters_the_target():
 )
 def test_target_entropy_by_hand(start, end, entropies):
     config = AgentConfig(target_entropy=start, final_target_entropy=end)
-    assert [agents.schedule(progress, config, action_dim=3).target_entropy for progress in (0.0, 0.25, 1.0)] == entropies
+    assert [agents.schedule(progress, 0, config, action_dim=3).target_entropy for progress in (0.0, 0.25, 1.0)] == entropies
 
 
 def test_target_critics_and_average_actor_move_by_their_rates():
@@ -361,9 +361,16 @@ def test_update_bc_overfits_a_tiny_batch_and_touches_only_the_actor():
 
 def test_learning_rate_moves_linearly_or_not_at_all():
     moving = AgentConfig(learning_rate=1e-3, final_learning_rate=1e-4)
-    assert np.allclose([agents.schedule(progress, moving, action_dim=1).learning_rate for progress in (0.0, 0.5, 1.0)], [1e-3, 5.5e-4, 1e-4])
+    assert np.allclose([agents.schedule(progress, 0, moving, action_dim=1).learning_rate for progress in (0.0, 0.5, 1.0)], [1e-3, 5.5e-4, 1e-4])
     constant = AgentConfig(learning_rate=1e-3, final_learning_rate=None)
-    assert [agents.schedule(progress, constant, action_dim=1).learning_rate for progress in (0.0, 1.0)] == [1e-3, 1e-3]
+    assert [agents.schedule(progress, 0, constant, action_dim=1).learning_rate for progress in (0.0, 1.0)] == [1e-3, 1e-3]
+
+
+def test_span_of_the_average_by_hand():
+    for rate, span, expected in ((0.2, 0.0, [0.2, 0.2, 0.2]), (1.0, 0.5, [1.0, 2 / 3, 0.1]), (0.3, 0.5, [0.3, 0.3, 0.1])):
+        config = AgentConfig(actor_average_rate=rate, actor_average_span=span)
+        rates = [agents.schedule(0.0, updates, config, action_dim=1).actor_average_rate for updates in (0, 1, 18)]
+        np.testing.assert_allclose(rates, expected, rtol=1e-6)
 
 
 def test_blocks_are_as_few_as_the_cache_allows_and_equal(monkeypatch):

@@ -1,6 +1,7 @@
 """Running experiments: thresholds of the summary, exact length of a run, and seeds that do not depend on each other."""
 
 import dataclasses
+import json
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 import hindrl_jax as hindrl
+from hindrl_jax import runs
 from hindrl_jax.config import SWEEPABLE, AgentConfig, BatchConfig, GoalConfig, TrainConfig, sweepable_value, with_values
 from hindrl_jax.experiment import Result, Row
 
@@ -29,7 +31,7 @@ CONFIG = TrainConfig(
 
 @pytest.fixture(scope="module")
 def demonstrations():
-    return hindrl.record_demonstrations(ENV, 2).episodes
+    return hindrl.record_demonstrations(ENV, 2)
 
 
 def row(seed, env_steps, success):
@@ -74,6 +76,8 @@ def test_demonstrated_states_are_asked_for_only_where_they_are_used_and_then_for
     with pytest.raises(hindrl.UserError, match="needs the states"):
         hindrl.fit(ENV, tables, dataclasses.replace(CONFIG, demo_reset_ratio=0.5), seeds=[3, 4])
     assert hindrl.fit(ENV, tables, CONFIG, seeds=[3, 4]).env_steps == 60
+    with pytest.raises(hindrl.UserError, match="states of shape"):
+        hindrl.fit(ENV, demonstrations.replace(states=demonstrations.states[..., :-1]), CONFIG)
 
 
 # Every sweepable field, with a value other than CONFIG's, in a config where each of them has a say.
@@ -85,6 +89,7 @@ OTHER_VALUES = dict(
     final_learning_rate=1e-3,
     target_update_rate=0.2,
     actor_average_rate=0.5,
+    actor_average_span=3.0,
     initial_alpha=0.1,
     target_entropy=-2.0,
     final_target_entropy=-4.0,
@@ -179,6 +184,45 @@ def test_a_saved_run_sees_its_inputs_as_it_did_in_training(saved, tmp_path):
     assert not scale.observation_centre.any()
     assert not scale.goal_centre.any()
     assert scale.goal_centre.shape == scale.goal.shape == (1, ENV.goal_dim)
+
+
+def test_a_film_that_cannot_be_drawn_is_a_warning(saved, tmp_path, monkeypatch):
+    def no_screen(env):
+        raise hindrl.UserError("no OpenGL library can draw")
+
+    monkeypatch.setattr(runs, "viewer", no_screen)
+    with pytest.warns(UserWarning, match=r"no episode\.gif: no OpenGL"):
+        summary = hindrl.save_run(tmp_path, saved[0])
+    assert json.loads((tmp_path / "summary.json").read_text()) == summary
+    assert not (tmp_path / "episode.gif").exists()
+    assert hindrl.load_run(tmp_path).spec.seeds == (0,)
+
+
+def test_the_reach_recipe_runs_from_demonstration_to_evaluation(tmp_path, monkeypatch):
+    """With every lever of the recipe, in a task so coarse and networks so small that it takes seconds."""
+    env = hindrl.make("FixedParameterizedReach", num_waypoints=1, position_tolerance=0.1, rotation_tolerance=0.3, horizon=100)
+    recipe = hindrl.preset("hindrl", env=env)
+    config = dataclasses.replace(
+        recipe,
+        steps=432,
+        num_envs=2,
+        updates_per_iteration=2,
+        learning_starts=400,
+        eval_every=16,
+        eval_episodes=2,
+        batch=dataclasses.replace(recipe.batch, batch_size=32),
+        agent=dataclasses.replace(recipe.agent, net_arch=(8,)),
+    )
+    demonstrations = hindrl.record_demonstrations(env, 1)
+    result = hindrl.fit(env, demonstrations, config, seeds=[0])
+    assert all(np.isfinite(value) for row in result.rows for value in row.metrics.values())
+    lengths = np.asarray(result.state.replay.episodes.lengths)
+    assert lengths[lengths > 0].min() < int(demonstrations.lengths[0]) / 2  # of episodes that began in a demonstrated state
+    monkeypatch.setattr(runs, "draw_episode", lambda path, env, states: path.touch())
+    hindrl.save_run(tmp_path, result)
+    (outcome,) = hindrl.load_run(tmp_path).evaluate(episodes=3)
+    assert outcome["seed"] == 0
+    assert 1 <= outcome["episode_length"] <= 100
 
 
 def test_damaged_parameters_are_refused(saved, tmp_path):

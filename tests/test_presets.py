@@ -6,6 +6,7 @@ import pytest
 
 from hindrl_jax.errors import UserError
 from hindrl_jax.presets import preset
+from hindrl_jax.registry import make
 from hindrl_jax.runs import TrainConfig
 
 # Appendix A.1.1 of the thesis, row by row.
@@ -51,6 +52,7 @@ FRAMEWORK = {
     "layer_norm": False,
     "input_encoding": "raw",
     "actor_average_rate": 1.0,
+    "actor_average_span": 0.0,
     "policy_input": "achieved_desired_observation",
     "inclusive_goal_test": True,
     "bc_loss": "squared",
@@ -105,6 +107,7 @@ def test_original_preset_differs_from_the_thesis_by_the_quirks_alone(env, more):
 def test_default_recipes_differ_by_family_and_the_grid_has_the_defaults_of_the_config():
     assert preset("hindrl", env="GridPickAndPlace") == preset("hindrl") == TrainConfig()
     reach = preset("hindrl", env="ParameterizedReach")
+    assert preset("hindrl", env=make("ParameterizedReach", num_waypoints=1)) == reach
     assert reach == preset("hindrl", env="FixedParameterizedReach") != TrainConfig()
     assert reach.demo_reset_ratio > 0.0
     assert preset("tqcfd", env="ParameterizedReach").batch.num_sampled_goals == 0.0

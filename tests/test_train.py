@@ -441,3 +441,16 @@ def test_grid_runs_end_to_end():
     assert 0.0 < metrics["critic/target"] <= 1.0
     assert np.all(np.asarray(evaluation.length) <= 8)
     assert state.replay.episodes.observations.shape == (8, 9, env.observation_dim)
+
+
+def test_with_span_1_the_averaged_actor_is_the_mean_of_all_actors(data):
+    agent = dataclasses.replace(make_config().agent, actor_average_rate=1.0, actor_average_span=1.0)
+    config, step = make_config(algo="bc", agent=agent), program(train.clone)
+    state, actors = train.init(jax.random.key(0), data, make_env(), config), []
+    for _ in range(4):
+        state, _ = step(state, data, env=make_env(), config=config, num_iterations=1)
+        actors.append(state.agent.actor)
+    mean = jax.tree.map(lambda *leaves: sum(leaves) / 4, *actors)
+    chex.assert_trees_all_close(state.agent.average_actor, mean, atol=1e-6)
+    chex.assert_trees_all_close(actors[0], actors[3], atol=0.1)
+    assert np.abs(mean["params"]["Dense_0"]["kernel"] - actors[3]["params"]["Dense_0"]["kernel"]).max() > 1e-4
