@@ -9,7 +9,7 @@ train: .venv/.installed  ## one demonstration, one seed, about a minute
 	.venv/bin/hindrl train --env FixedGridPickAndPlace --algo hindrl --demos 1 --seeds 1 --out runs/quickstart --overwrite
 
 test: .venv/.installed-test
-	.venv/bin/python -m pytest
+	.venv/bin/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile
 
 test-slow: .venv/.installed-test  ## the learning tests, which take minutes each
 	.venv/bin/python -m pytest -m slow

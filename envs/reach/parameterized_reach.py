@@ -112,8 +112,11 @@ class _Reach(abc.ABC):
 
     @property
     def compiler_options(self) -> dict[str, Any]:
-        """Options for XLA programs that step this environment: its newer fusion code for CPUs makes MJX several hundred times slower."""
-        return {"xla_cpu_use_fusion_emitters": False} if self.backend == "mjx" and jax.default_backend() == "cpu" else {}
+        """Options for XLA programs that step this environment: on CPUs, its newer fusion code makes MJX several hundred times slower, and its
+        concurrent scheduler can leave large batches of MJX waiting for ever (both seen with jaxlib 0.10.2)."""
+        if self.backend != "mjx" or jax.default_backend() != "cpu":
+            return {}
+        return {"xla_cpu_use_fusion_emitters": False, "xla_cpu_enable_concurrency_optimized_scheduler": False}
 
     @property
     def state_dim(self) -> int:

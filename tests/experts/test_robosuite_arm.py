@@ -350,10 +350,16 @@ def test_each_seed_plays_its_own_policy_towards_one_of_its_goals_per_episode(run
     acted = []
 
     def stub_player(env, act, num_episodes):
+        @jax.jit
+        def act_twice(key):
+            key_reset, *keys_act = jax.random.split(key, 3)
+            with jax.debug_key_reuse(False):  # the episode's goal is drawn at every step, always with the key in the state
+                state, observation = env.reset(key_reset)
+                return jnp.stack([act(key_act, state, observation) for key_act in keys_act])
+
         def play_one(key):
-            state, observation = env.reset(key)
-            acted.append(np.stack([act(key_act, state, observation) for key_act in jax.random.split(key)]))
-            return SimpleNamespace(lengths=np.ones(num_episodes), terminated=np.ones(num_episodes, bool), observation=observation)
+            acted.append(np.asarray(act_twice(key)))
+            return SimpleNamespace(lengths=np.ones(num_episodes), terminated=np.ones(num_episodes, bool))
 
         return play_one
 
@@ -404,9 +410,12 @@ def installed(**versions):
 @pytest.mark.parametrize(
     ("versions", "message"),
     [
-        (dict(mujoco="3.9.0"), r"needs robosuite, which is not installed: pip install 'hindrl-jax\[robosuite\]'$"),
+        (dict(mujoco="3.9.0"), r"needs robosuite, which is not installed: .*-m pip install robosuite==1.5.1 'mujoco==3.9.\*'$"),
         (dict(mujoco="3.10.0", robosuite="1.5.1"), r"needs robosuite 1.5.1 with mujoco 3.9, but robosuite 1.5.1 and mujoco 3.10.0 are installed"),
-        (dict(mujoco="3.9.0", robosuite="1.5.2"), r"but robosuite 1.5.2 and mujoco 3.9.0 are installed: pip install 'hindrl-jax\[robosuite\]'$"),
+        (
+            dict(mujoco="3.9.0", robosuite="1.5.2"),
+            r"but robosuite 1.5.2 and mujoco 3.9.0 are installed: -m pip install robosuite==1.5.1 'mujoco==3.9.\*'$",
+        ),
         (dict(mujoco="3.90.0", robosuite="1.5.1"), r"mujoco 3.90.0"),
     ],
 )
@@ -426,7 +435,7 @@ def test_versions_that_go_together_are_accepted(monkeypatch):
     [
         ("libGL.so.1: cannot open shared object file: No such file or directory", "apt-get install libgl1 libglib2.0-0"),
         ("libgthread-2.0.so.0: cannot open shared object file", "apt-get install libgl1 libglib2.0-0"),
-        ("No module named 'termcolor'", "pip install 'hindrl-jax"),
+        ("No module named 'termcolor'", "-m pip install robosuite==1.5.1"),
     ],
 )
 def test_an_import_that_fails_says_what_to_install(error, message, monkeypatch):
