@@ -8,8 +8,8 @@ PEERS_PIP = benchmarks/$(PIP) -r benchmarks/requirements-peers.txt
 train: .venv/.installed  ## one demonstration, one seed, about a minute
 	.venv/bin/hindrl train --env FixedGridPickAndPlace --algo hindrl --demos 1 --seeds 1 --out runs/quickstart --overwrite
 
-test: .venv/.installed-test
-	.venv/bin/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile
+test: .venv/.installed-test  ## two files at a time; more would need 5 GiB of memory each
+	.venv/bin/python -m pytest --numprocesses auto --maxprocesses 2 --dist loadfile
 
 test-slow: .venv/.installed-test  ## the learning tests, which take minutes each
 	.venv/bin/python -m pytest -m slow

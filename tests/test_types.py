@@ -52,6 +52,7 @@ def test_protocols(env):
 def test_only_mjx_on_a_cpu_needs_options_of_the_compiler(monkeypatch):
     plain = [Corridor(), GridPickAndPlace(), FixedParameterizedReach(), FixedParameterizedReach(backend="robosuite")]
     assert [compiler_options(env) for env in plain] == [{}] * 4
-    assert compiler_options(ParameterizedReach(backend="mjx")) == {"xla_cpu_use_fusion_emitters": False}
+    options = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_enable_concurrency_optimized_scheduler": False}
+    assert compiler_options(ParameterizedReach(backend="mjx")) == options
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert compiler_options(ParameterizedReach(backend="mjx")) == {}
