@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experts.robosuite_arm import play_in_robosuite
 from hindrl_jax.errors import UserError
 from hindrl_jax.types import Array, Episodes, RestorableEnvironment, action_from_env, compiler_options, tree_where
 
@@ -77,8 +78,6 @@ def player(env: RestorableEnvironment, act: Act, num_episodes: int) -> Callable[
       UserError: from the program, if the environment is simulated by robosuite and that is missing or unusable.
     """
     if on_host(env):
-        from experts.robosuite_arm import play_in_robosuite
-
         return lambda key: play_in_robosuite(key, env, act, num_episodes)
     return jax.jit(lambda key: play(key, env, act, num_episodes), compiler_options=compiler_options(env))
 

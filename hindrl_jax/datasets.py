@@ -116,8 +116,8 @@ def save_demonstrations(
     path = Path(path)
     table = Episodes(**{field.name: np.asarray(getattr(demonstrations, field.name)) for field in dataclasses.fields(Episodes)})
     expected = (*table.observations.shape[:2], env.state_dim)
-    if np.shape(table.states) != expected:
-        raise ValueError(f"states must have shape {expected}, found {np.shape(table.states)}")
+    if table.states.shape != expected:
+        raise ValueError(f"states must have shape {expected}, found {table.states.shape}")
     achieved_goals = np.asarray(env.achieved_goal(table.observations))
 
     def write(file: h5py.File) -> None:
@@ -176,9 +176,17 @@ def check_can_write(path: Path, *, overwrite: bool) -> None:
         raise UserError(f"{path}: is a folder; name a file")
     if path.exists() and not overwrite:
         raise UserError(f"{path}: exists already; allow overwriting it or choose another name")
-    existing = next(folder for folder in path.absolute().parents if folder.exists())
-    if not existing.is_dir() or not os.access(existing, os.W_OK):
-        raise UserError(f"{path}: cannot be written, since {existing} is {'read-only' if existing.is_dir() else 'a file'}; choose another place")
+    reason = why_unwritable(path.absolute().parent)
+    if reason:
+        raise UserError(f"{path}: cannot be written, since {reason}; choose another place")
+
+
+def why_unwritable(folder: Path) -> str | None:
+    """What is in the way of files in a folder, which may have to be made first; None if nothing is."""
+    existing = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    if not existing.is_dir():
+        return f"{existing} is a file"
+    return None if os.access(existing, os.W_OK) else f"{existing} is read-only"
 
 
 def load_demonstrations(path: str | os.PathLike[str], env: RestorableEnvironment, *, num_demos: int | None = None) -> Episodes:

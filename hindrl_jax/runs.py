@@ -33,6 +33,7 @@ from hindrl_jax import plots, rollout
 from hindrl_jax import train as training
 from hindrl_jax.agent import InputScale
 from hindrl_jax.config import TrainConfig, with_values
+from hindrl_jax.datasets import why_unwritable
 from hindrl_jax.errors import UserError, one_line
 from hindrl_jax.experiment import Result, Row
 from hindrl_jax.goals import GoalTable, sample_goals
@@ -148,10 +149,9 @@ class RunWriter:
         there = [name for name in _FILES if (path / name).exists()]
         if there and not overwrite:
             raise UserError(f"{path} already holds a run ({', '.join(there)}): choose another --out, or replace it with --overwrite")
-        existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
-        if not existing.is_dir() or not os.access(existing, os.W_OK):
-            reason = "read-only" if existing.is_dir() else "a file"
-            raise UserError(f"cannot write {path} ({existing} is {reason}): choose another --out")
+        reason = why_unwritable(path)
+        if reason:
+            raise UserError(f"cannot write {path} ({reason}): choose another --out")
         self.rows_written = 0
         self.started = False
 
