@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import io
 import itertools
 import os
@@ -11,7 +12,7 @@ import re
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,13 +22,13 @@ import numpy as np
 import tyro
 from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from experts.by_hand import record_by_hand
 from experts.recording import on_host
 from experts.robosuite_arm import DeviceName
-from hindrl_jax import STARTED, __version__
+from hindrl_jax import STARTED, __version__, ablation
 from hindrl_jax.config import SWEEPABLE, TrainConfig, without_effect
 from hindrl_jax.datasets import DemonstrationSummary, check_can_write, describe_demonstrations, load_demonstrations, read_states, save_demonstrations
 from hindrl_jax.errors import UserError, one_line
@@ -180,7 +181,7 @@ def _hosts(options: TrainOptions) -> Iterator[bool]:
 def _fit(spec: RunSpec, configs: Sequence[TrainConfig], writers: Sequence[RunWriter]) -> Result:
     """Trains all seeds of all configs at once, with a progress bar; each writer gets the runs of its config. Without writers, quietly."""
     demonstrations = _demonstrations(spec)
-    num_seeds, num_runs = len(spec.seeds), len(spec.seeds) * len(configs)
+    num_seeds = len(spec.seeds)
     seeds = f"seed {spec.seeds[0]}" if num_seeds == 1 else f"{num_seeds} seeds from {spec.seeds[0]}"
     settings = f", {len(configs)} settings" if len(configs) > 1 else ""
     runs = dict(seeds=spec.seeds * len(configs), config=[config for config in configs for _ in spec.seeds])
@@ -188,11 +189,8 @@ def _fit(spec: RunSpec, configs: Sequence[TrainConfig], writers: Sequence[RunWri
         return fit(spec.env, demonstrations * len(configs), **runs)
     console.print(f"{spec.env.name}, {spec.config.algo}, {_count(demonstrations[0].lengths.shape[0], 'demonstration')}, {seeds}{settings}")
 
-    unit = "updates" if spec.config.algo == "bc" else "steps"
-    columns = ("{task.description}", BarColumn(), f"{{task.completed:,.0f}}/{{task.total:,.0f}} {unit}", "{task.fields[rates]}", "left")
-    progress = Progress(*(TextColumn(c) if isinstance(c, str) else c for c in columns), TimeRemainingColumn(), console=console)
-    with progress:
-        bar = progress.add_task("compiling", total=spec.config.steps, rates="")
+    with _progress() as progress:
+        bar = _add_bar(progress, spec.config)
 
         def report(result: Result) -> None:
             if not writers[0].started:
@@ -206,17 +204,32 @@ def _fit(spec: RunSpec, configs: Sequence[TrainConfig], writers: Sequence[RunWri
                 writer.report(result.rows_of(slice(index * num_seeds, (index + 1) * num_seeds)))
             if new_rows:
                 progress.console.print(_evaluation_line(new_rows))
-            success = result.latest_success()
-            seconds = max(result.train_seconds, 1e-9)
-            rates = f"{num_runs * result.env_steps / seconds:,.0f} steps/s, {num_runs * result.updates / seconds:,.0f} updates/s"
-            progress.update(
-                bar,
-                completed=min(result.steps_done, spec.config.steps),
-                description="training" if success is None else f"success {success:4.0%}",
-                rates=rates if result.train_seconds else "",
-            )
+            _advance(progress, bar, result)
 
         return fit(spec.env, demonstrations * len(configs), **runs, report=report)
+
+
+def _progress(*, transient: bool = False) -> Progress:
+    """A place for the bars of trainings."""
+    columns = ("{task.description}", BarColumn(), "{task.completed:,.0f}/{task.total:,.0f} {task.fields[unit]}", "{task.fields[rates]}", "left")
+    return Progress(*(TextColumn(c) if isinstance(c, str) else c for c in columns), TimeRemainingColumn(), console=console, transient=transient)
+
+
+def _add_bar(progress: Progress, config: TrainConfig, *, name: str = "") -> TaskID:
+    """A bar for one training, which `_advance` moves; `name` says which, where there are several."""
+    return progress.add_task(f"{name}compiling", total=config.steps, unit="updates" if config.algo == "bc" else "steps", rates="")
+
+
+def _advance(progress: Progress, bar: TaskID, result: Result, *, name: str = "") -> None:
+    """Brings a bar up to date."""
+    success, runs, seconds = result.latest_success(), len(result.seeds), max(result.train_seconds, 1e-9)
+    rates = f"{runs * result.env_steps / seconds:,.0f} steps/s, {runs * result.updates / seconds:,.0f} updates/s"
+    progress.update(
+        bar,
+        completed=min(result.steps_done, result.config.steps),
+        description=name + ("training" if success is None else f"success {success:4.0%}"),
+        rates=rates if result.train_seconds else "",
+    )
 
 
 def _on_devices(result: Result) -> str:
@@ -268,11 +281,16 @@ def _parse_train(arguments: list[str], options_class: type[TrainOptions] = Train
         count, first = (len(seeds) if options.seeds is None else options.seeds), (seeds[0] if options.seed is None else options.seed)
         if count < 1:
             raise UserError(f"--seeds {count} is too few: train at least 1 seed")
-        if not 0 <= first <= 2**32 - count:
-            raise UserError(f"--seed {first} is not usable: choose a whole number from 0 to {2**32 - count}")
-        seeds = tuple(range(first, first + count))
+        seeds = _seeds(count, first)
     demos = options.demos if _is_number(options.demos) or options.demos == FROM_PYTHON else str(Path(options.demos).absolute())
     return RunSpec(env=parsed.environment, config=parsed.training, demos=demos, seeds=seeds), options
+
+
+def _seeds(count: int, first: int) -> tuple[int, ...]:
+    """That many seeds, one after the other."""
+    if not 0 <= first <= 2**32 - count:
+        raise UserError(f"--seed {first} is not usable: choose a whole number from 0 to {2**32 - count}")
+    return tuple(range(first, first + count))
 
 
 def _peek(arguments: Sequence[str], name: str) -> str | None:
@@ -605,6 +623,94 @@ def _envs(arguments: list[str]) -> None:
             console.print(f"  --{field.name.replace('_', '-')} (default {field.default})")
 
 
+# ------------------------------------------------------------------------------------------------------------------------------ reproduce
+
+
+@dataclasses.dataclass(frozen=True)
+class Ablation:
+    """Options of `hindrl reproduce ablation`."""
+
+    out: Path = Path("runs/ablation")
+    """Directory of the tables and of all runs. Started again with the same options, what is finished there is kept and the rest is trained."""
+    tasks: tuple[str, ...] = ()
+    """What to train on: fixed-1, fixed-5 or random-50, the fixed or the random grid with that many demonstrations (default: all)."""
+    levers: tuple[str, ...] = ()
+    """The changes to train, next to the recipe as it is (default: all; --list shows them)."""
+    seeds: int = 16
+    """Number of seeds, side by side; the same for all changes. With fewer than 8 or so the intervals are much too narrow."""
+    seed: int = 2_000
+    """The first seed; the others follow it."""
+    steps: int | None = None
+    """Environment steps of each run (default: the recipe's)."""
+    overwrite: bool = False
+    """Replace runs that were made with other options. To train one again with the same options, remove its directory."""
+    list: bool = False
+    """Show the changes there are, and train nothing."""
+
+
+def _reproduce_ablation(arguments: list[str]) -> None:
+    """Train the default recipe with one change at a time, and compare."""
+    options = _parse(Ablation, arguments, "hindrl reproduce ablation", _reproduce_ablation.__doc__)
+    if options.list:
+        console.print(_lever_table())
+        return
+    tasks = _chosen(options.tasks, ablation.ABLATION_TASKS, "--tasks")
+    levers = {lever.name: lever for lever in ablation.LEVERS}
+    names = _chosen(options.levers, levers, "--levers")
+    if options.seeds < 2:
+        raise UserError(f"--seeds {options.seeds} is too few: an interval needs at least 2")
+    settings_of = functools.partial(ablation.settings_of, options.out, seeds=_seeds(options.seeds, options.seed), steps=options.steps)
+    settings = settings_of(tasks=tasks, levers=[levers[name] for name in names])
+    # The tables hold all that is there, also from an earlier start with other levers, so all of it must be of the same options.
+    everything = settings_of(tasks=ablation.ABLATION_TASKS, levers=ablation.LEVERS)
+    ablation.check_can_train(settings if options.overwrite else everything, overwrite=options.overwrite)
+    to_train = [setting for setting in settings if not ablation.is_finished(setting)]
+    kept = len(settings) - len(to_train)
+    console.print(f"{_count(len(to_train), 'setting')} to train, {_count(options.seeds, 'seed')} from {options.seed}, {kept} finished before")
+
+    started = time.perf_counter()
+    with _progress(transient=True) as progress:
+        for trained, setting in enumerate(to_train, 1):
+            name = f"{setting.task} {setting.lever.name}: "
+            bar = _add_bar(progress, setting.spec.config, name=name)
+            ablation.train(setting, report=functools.partial(_advance, progress, bar, name=name))
+            progress.remove_task(bar)
+            outcomes = ablation.outcomes_of(everything)
+            ablation.write_tables(options.out, outcomes)
+            left = len(to_train) - trained
+            minutes = (time.perf_counter() - started) / trained * left / 60
+            (outcome,) = (outcome for outcome in outcomes if outcome.setting == setting)
+            progress.console.print(_outcome_line(outcome) + (f"   {left} left, about {minutes:,.0f} min" if left else ""))
+    if not to_train:
+        ablation.write_tables(options.out, ablation.outcomes_of(everything))
+    console.print(f"wrote {options.out}: {ablation.TABLE}, {ablation.TEXT}, {ablation.PICTURE}, and a run's directory for each setting")
+
+
+def _chosen(names: Sequence[str], known: Iterable[str], flag: str) -> list[str]:
+    """The chosen ones of what is known, each once and in the order in which they are known; all of them where none is chosen."""
+    known = list(known)
+    for name in names:
+        if name not in known:
+            raise UserError(f"{flag} {name} is not known{did_you_mean(name, known)}: choose among {', '.join(known)}")
+    return [name for name in known if name in names or not names]
+
+
+def _lever_table() -> Table:
+    table = Table("lever", "group", "what it changes", box=box.SIMPLE_HEAD)
+    for lever in ablation.LEVERS:
+        table.add_row(lever.name, lever.group, lever.summary)
+    return table
+
+
+def _outcome_line(outcome: ablation.Outcome) -> str:
+    spec, steps = outcome.setting.spec, outcome.steps_to_95.estimate
+    median = f"median {steps:9,.0f} steps" if np.isfinite(steps) else f"median {'never':>9}      "
+    return (
+        f"{outcome.setting.task:<10}{outcome.setting.lever.name:<22}{outcome.seeds_reaching_95:3d} of {len(spec.seeds)} reach 95%, {median}   "
+        f"final {outcome.final_success.estimate:4.0%}   {outcome.seconds_per_seed * len(spec.seeds):6.1f} s"
+    )
+
+
 # ------------------------------------------------------------------------------------------------------------------------------- plumbing
 
 Command = Callable[[list[str]], None]
@@ -614,6 +720,7 @@ COMMANDS: dict[str, Command | dict[str, Command]] = {
     "eval": _eval,
     "render": _render,
     "demos": {"record": _demos_record, "info": _demos_info, "plot": _demos_plot, "render": _demos_render},
+    "reproduce": {"ablation": _reproduce_ablation},
     "envs": _envs,
 }
 
@@ -650,7 +757,7 @@ def _usage() -> str:
     lines = [f"hindrl {__version__}: learn sparse-reward tasks from a handful of demonstrations", ""]
     for name, command in COMMANDS.items():
         for words, function in [(name, command)] if callable(command) else [(f"{name} {sub}", f) for sub, f in command.items()]:
-            lines.append(f"  hindrl {words:<14}{function.__doc__}")
+            lines.append(f"  hindrl {words:<20}{function.__doc__}")
     return "\n".join([*lines, "", "Each takes --help."])
 
 
@@ -693,7 +800,8 @@ def main(arguments: list[str] | None = None) -> None:
     if arguments is None:
         arguments = sys.argv[1:]
         _set_up_jax()
-    if arguments in (["--help"], ["-h"], ["demos", "--help"], ["demos", "-h"]):
+    *group, last = arguments or [""]
+    if last in ("--help", "-h") and (not group or (len(group) == 1 and isinstance(COMMANDS.get(group[0]), dict))):
         print(_usage())
         return
     try:

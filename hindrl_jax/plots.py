@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
+    from hindrl_jax.ablation import Outcome
     from hindrl_jax.experiment import Result
 
 _MEAN, _SEED, _DEMO = "#1f5fa8", "#9dbfe3", "#c77b00"
+_VERDICTS = {"better": "#1f5fa8", "worse": "#b3261e", "open": "0.5"}
 
 
 def save_curve(result: Result, path: Path) -> None:
@@ -50,6 +52,42 @@ def save_sweep(parts: Sequence[Result], labels: Sequence[str], path: Path) -> No
     axis.set_title(_title(parts[0]) + seeds, loc="left")
     _mark_success(axis)
     _tidy([axis])
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def save_ablation(outcomes: Sequence[Outcome], path: Path) -> None:
+    """Draws, for each task of an ablation, how each change moves the mean success along the run, with 95% intervals, as a PNG.
+
+    A row for each change, by groups; the same rows for all tasks.
+    """
+    plt = _pyplot()
+    tasks = list(dict.fromkeys(outcome.setting.task for outcome in outcomes))
+    levers = dict.fromkeys(outcome.setting.lever for outcome in outcomes if outcome.setting.lever.changes)
+    groups = dict.fromkeys(lever.group for lever in levers)
+    rows = [row for group in groups for row in (group, *(lever for lever in levers if lever.group == group))]
+    size = (3.0 + 3.6 * len(tasks), 1.5 + 0.2 * len(rows))
+    figure, grid = plt.subplots(1, len(tasks), figsize=size, sharex=True, sharey=True, squeeze=False, layout="constrained")
+    for axis, task in zip(grid[0], tasks, strict=True):
+        axis.axvline(0.0, color="0.3", linewidth=1)
+        for outcome in outcomes:
+            if outcome.setting.task == task and outcome.setting.lever in levers:
+                y, colour = rows.index(outcome.setting.lever), _VERDICTS[outcome.verdict()]
+                estimate, low, high = (100 * value for value in (outcome.difference.estimate, outcome.difference.low, outcome.difference.high))
+                axis.plot((low, high), (y, y), color=colour, linewidth=3, solid_capstyle="butt", alpha=0.55)
+                axis.plot(estimate, y, color=colour, marker="o", markersize=5)
+                axis.text(1.01, y, f"{estimate:+.1f}", color=colour, transform=axis.get_yaxis_transform(), va="center", fontsize=8)
+        axis.set_title(task, loc="left")
+        axis.set(xlabel="change of mean success along the run, points")
+        axis.set_yticks(range(len(rows)), [row if isinstance(row, str) else row.name for row in rows])
+        axis.tick_params(axis="y", length=0)
+        axis.set(ylim=(len(rows) - 0.4, -0.6))
+    for label, row in zip(grid[0, 0].get_yticklabels(), rows, strict=True):
+        if isinstance(row, str):
+            label.set(fontweight="bold")
+    _tidy(grid[0])
+    seeds = len(outcomes[0].setting.spec.seeds)
+    figure.suptitle(f"one change to the default recipe, {seeds} seeds, 95% intervals; blue better, red worse, grey open", x=0.01, ha="left")
     figure.savefig(path, dpi=130)
     plt.close(figure)
 
