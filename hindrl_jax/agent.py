@@ -1,4 +1,4 @@
-"""The agent: truncated quantile critics, a tanh-Gaussian actor with a behaviour cloning loss, an automatic entropy coefficient.
+"""The agent: truncated quantile critics (or those of SAC, TD3 or DDPG), an actor with a behaviour cloning loss, an automatic entropy coefficient.
 
 One `update` serves TQCfD, HinDRL and Smooth HinDRL, which differ only in the batch they are given; `update_bc` is the BC baseline, on the
 same actor. Differences from the TQC paper (Kuznetsov et al., 2020): the loss is averaged, not summed, over quantiles (as in sb3-contrib,
@@ -8,6 +8,7 @@ also: inputs encoded at two scales, a target entropy that falls along the run, a
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -17,9 +18,9 @@ import optax
 from flax import struct
 
 from hindrl_jax.config import AgentConfig
-from hindrl_jax.losses import behaviour_cloning, entropy_coefficient, quantile_huber, target_atoms
+from hindrl_jax.losses import behaviour_cloning, entropy_coefficient, quantile_huber, squared_error, target_atoms, target_value
 from hindrl_jax.networks import Params, apply_actor, apply_critics, init_actor, init_critics, mean_return
-from hindrl_jax.types import Array, Transition
+from hindrl_jax.types import Array, Transition, tree_where
 
 Metrics = dict[str, Array]
 
@@ -30,6 +31,7 @@ class AgentState:
 
     actor: Params
     average_actor: Params  # running average of the actor, which acts more steadily
+    target_actor: Params | None  # follows the actor as the target critics follow the critics; None for algorithms without one
     critics: Params  # leaves (N, ...)
     target_critics: Params  # leaves (N, ...)
     log_alpha: Array  # ()
@@ -117,6 +119,7 @@ def init(key: Array, config: AgentConfig, *, observation_dim: int, goal_dim: int
     return AgentState(
         actor=actor,
         average_actor=jax.tree.map(jnp.copy, actor),
+        target_actor=None if config.has_entropy else jax.tree.map(jnp.copy, actor),
         critics=critics,
         target_critics=jax.tree.map(jnp.copy, critics),
         log_alpha=log_alpha,
@@ -127,9 +130,16 @@ def init(key: Array, config: AgentConfig, *, observation_dim: int, goal_dim: int
 
 
 def select_action(key: Array, actor: Params, inputs: Array, config: AgentConfig, *, action_dim: int, stochastic: bool) -> Array:
-    """Actions (B, A) in [-1, 1] at inputs (B, input_dim), see `network_inputs`: sampled from the policy, or its mode."""
+    """Actions (B, A) in [-1, 1] at inputs (B, input_dim), see `network_inputs`: sampled from the policy, or its mode.
+
+    The samples of a deterministic policy (td3, ddpg) are its mode with noise.
+    """
     distribution = apply_actor(actor, inputs.T, config, action_dim=action_dim)
-    return (distribution.sample(key)[0] if stochastic else distribution.mode).T
+    if not stochastic:
+        return distribution.mode.T
+    if config.has_entropy:
+        return distribution.sample(key)[0].T
+    return jnp.clip(distribution.mode.T + config.exploration_noise * jax.random.normal(key, (inputs.shape[0], action_dim)), -1.0, 1.0)
 
 
 @struct.dataclass(kw_only=True)
@@ -139,13 +149,14 @@ class Schedule:
     learning_rate: Array | float  # () step size of Adam
     target_entropy: Array | float  # () in nats
     actor_average_rate: Array | float  # () share of the actor that moves into its running average
+    bc_weight: Array | float  # () weight of the behaviour cloning loss
 
 
 def schedule(progress: Array | float, updates: Array | int, config: AgentConfig, *, action_dim: int) -> Schedule:
     """What holds at one moment of a run.
 
-    Learning rate and target entropy move linearly. With a span s, the rate of the actor's average falls like 1 / (1 + s updates), the
-    polynomial-decay averaging of Shamir and Zhang (stochastic gradient descent for non-smooth optimization, 2013).
+    Learning rate, target entropy and the weight of cloning move linearly. With a span s, the rate of the actor's average falls like
+    1 / (1 + s updates), the polynomial-decay averaging of Shamir and Zhang (stochastic gradient descent for non-smooth optimization, 2013).
 
     Args:
       progress: share of the run that is over, in [0, 1].
@@ -161,10 +172,15 @@ def schedule(progress: Array | float, updates: Array | int, config: AgentConfig,
         learning_rate=between(config.learning_rate, config.final_learning_rate),
         target_entropy=between(entropy, config.final_target_entropy),
         actor_average_rate=jnp.minimum(config.actor_average_rate, 1.0 / (1.0 + config.actor_average_span * updates)),
+        bc_weight=between(config.bc_weight, config.final_bc_weight),
     )
 
 
-def _descend(gradient: Any, optimiser_state: optax.OptState, params: Any, learning_rate: Array | float) -> tuple[Any, optax.OptState]:
+def _descend(
+    gradient: Any, optimiser_state: optax.OptState, params: Any, learning_rate: Array | float, *, max_norm: float | None = None
+) -> tuple[Any, optax.OptState]:
+    if max_norm is not None:
+        gradient, _ = optax.clip_by_global_norm(max_norm).update(gradient, optax.EmptyState())
     updates, optimiser_state = _ADAM.update(gradient, optimiser_state, params)
     return jax.tree.map(lambda param, update: param - learning_rate * update, params, updates), optimiser_state
 
@@ -212,10 +228,12 @@ def _mean_over_blocks(function: Callable[[_Columns], Any], columns: _Columns, nu
 def update(
     key: Array, state: AgentState, batch: Transition, *, inputs: Array, next_inputs: Array, schedule: Schedule, config: AgentConfig
 ) -> tuple[AgentState, Metrics]:
-    """One gradient step of critics, actor and entropy coefficient, then one move of the target critics and of the averaged actor.
+    """One gradient step of critics, actor and entropy coefficient, then one move of the target networks and of the averaged actor.
 
-    Critic: quantile Huber loss towards the truncated atoms of r + discount (Z' - alpha log pi(a' | s')).
-    Actor: mean(alpha log pi - mean over critics and quantiles of Z(s, a_pi)) + bc_weight * behaviour cloning loss.
+    Critic: quantile Huber loss towards the truncated atoms of r + discount (Z' - alpha log pi(a' | s')); for algorithms without quantiles the
+      squared error to r + discount (min Q' - alpha log pi(a' | s')).
+    Actor: mean(alpha log pi - value(s, a_pi)) + bc_weight * behaviour cloning loss; the value is the mean over critics and quantiles (tqc), the
+      least critic's (sac) or the first one's (td3, ddpg).
 
     Args:
       key: random key.
@@ -228,10 +246,8 @@ def update(
     Returns:
       The new agent and scalar metrics.
     """
-    key_actor, key_next = jax.random.split(key)
-    action_dim = batch.action.shape[-1]
+    key_actor, key_next, key_critics = jax.random.split(key, 3)
     num_blocks = _num_blocks(batch.action.shape[0], config)
-    alpha = jnp.exp(state.log_alpha)
     # The barrier makes the transposition one copy, not a strided read in every product.
     inputs, next_inputs, action = jax.lax.optimization_barrier((inputs.T, next_inputs.T, batch.action.T))
     columns = _Columns(
@@ -246,70 +262,108 @@ def update(
         next_noise=jax.random.normal(key_next, action.shape),
     )
 
-    def critic_gradient(block: _Columns) -> tuple[Params, Metrics]:
-        next_action, next_log_prob = apply_actor(state.actor, block.next_inputs, config, action_dim=action_dim).at(block.next_noise)
-        next_atoms = apply_critics(state.target_critics, block.next_inputs, next_action, config)
-        targets = target_atoms(
-            next_atoms.reshape(-1, next_atoms.shape[-1]),
-            reward=block.reward,
-            discount=block.discount,
-            entropy_bonus=-alpha * next_log_prob,
-            num_dropped=config.num_critics * config.top_quantiles_to_drop_per_net,
-        )
-        if config.clip_targets:
-            targets = jnp.clip(targets, 0.0, 1.0)
-        if block.obtained_return is not None:
-            targets = jnp.maximum(targets, block.obtained_return[None])
-
-        def loss(critics: Params) -> tuple[Array, Metrics]:
-            quantiles = apply_critics(critics, block.inputs, block.action, config)
-            value = jnp.mean(quantile_huber(quantiles, targets))
-            return value, {"critic/loss": value, "critic/value": jnp.mean(quantiles), "critic/target": jnp.mean(targets)}
-
-        return jax.grad(loss, has_aux=True)(state.critics)
-
-    gradient, critic_metrics = _mean_over_blocks(critic_gradient, columns, num_blocks)
-    critics, critic_optimiser = _descend(gradient, state.critic_optimiser, state.critics, schedule.learning_rate)
-
-    def actor_gradient(block: _Columns) -> tuple[Params, Metrics]:
-        def loss(actor: Params) -> tuple[Array, Metrics]:
-            distribution = apply_actor(actor, block.inputs, config, action_dim=action_dim)
-            action, log_prob = distribution.at(block.noise)
-            value = jnp.mean(mean_return(critics, block.inputs, action, config))
-            cloned = distribution.mode if config.bc_action == "mean" else action
-            bc = behaviour_cloning(cloned, block.action, block.is_demonstration, form=config.bc_loss)
-            entropy = -jnp.mean(log_prob)
-            total = -alpha * entropy - value + config.bc_weight * bc
-            return total, {"actor/loss": total, "actor/bc_loss": bc, "actor/value": value, "actor/entropy": entropy}
-
-        return jax.grad(loss, has_aux=True)(state.actor)
-
-    gradient, actor_metrics = _mean_over_blocks(actor_gradient, columns, num_blocks)
-    actor, actor_optimiser = _descend(gradient, state.actor_optimiser, state.actor, schedule.learning_rate)
-
-    loss_alpha, gradient = jax.value_and_grad(entropy_coefficient)(
-        state.log_alpha, -actor_metrics["actor/entropy"], target_entropy=schedule.target_entropy
-    )
-    log_alpha, alpha_optimiser = _descend(gradient, state.alpha_optimiser, state.log_alpha, schedule.learning_rate)
-
-    new_state = AgentState(
-        actor=actor,
-        average_actor=optax.incremental_update(actor, state.average_actor, schedule.actor_average_rate),
+    target_critics = state.target_critics
+    if config.num_target_critics is not None:
+        chosen = jax.random.permutation(key_critics, config.num_critics)[: config.num_target_critics]
+        target_critics = jax.tree.map(lambda leaf: leaf[chosen], target_critics)
+    gradient, critic_metrics = _mean_over_blocks(functools.partial(_critic_gradient, state, target_critics, config), columns, num_blocks)
+    critics, critic_optimiser = _descend(gradient, state.critic_optimiser, state.critics, schedule.learning_rate, max_norm=config.max_gradient_norm)
+    state = state.replace(
         critics=critics,
-        target_critics=optax.incremental_update(critics, state.target_critics, config.target_update_rate),
-        log_alpha=log_alpha,
-        actor_optimiser=actor_optimiser,
         critic_optimiser=critic_optimiser,
-        alpha_optimiser=alpha_optimiser,
+        target_critics=optax.incremental_update(critics, state.target_critics, config.target_update_rate),
     )
-    metrics = {
-        **critic_metrics,
-        **actor_metrics,
-        "alpha/loss": loss_alpha,
-        "alpha/value": alpha,
-        "batch/reward": jnp.sum(batch.reward),
-    }
-    return new_state, metrics
+
+    gradient, actor_metrics = _mean_over_blocks(functools.partial(_actor_gradient, state, schedule, config), columns, num_blocks)
+    moved, alpha_metrics = _move_actor(state, gradient, actor_metrics["actor/entropy"], schedule, config)
+    if config.actor_delay > 1:
+        moved = tree_where(critic_optimiser.count % config.actor_delay == 0, moved, state)
+    return moved, {**critic_metrics, **actor_metrics, **alpha_metrics, "batch/reward": jnp.sum(batch.reward)}
+
+
+def _critic_gradient(state: AgentState, target_critics: Params, config: AgentConfig, block: _Columns) -> tuple[Params, Metrics]:
+    """The gradient of the critics' loss over a block, and metrics."""
+    next_action, entropy_bonus = _next_action(state, config, block)
+    next_atoms = apply_critics(target_critics, block.next_inputs, next_action, config)  # (N, Q, B)
+    bellman = dict(reward=block.reward, discount=block.discount, entropy_bonus=entropy_bonus)
+    if config.base == "tqc":
+        num_dropped = next_atoms.shape[0] * config.top_quantiles_to_drop_per_net
+        targets = target_atoms(next_atoms.reshape(-1, next_atoms.shape[-1]), **bellman, num_dropped=num_dropped)
+    else:
+        targets = target_value(next_atoms[:, 0], **bellman)
+    if config.clip_targets:
+        targets = jnp.clip(targets, 0.0, 1.0)
+    if block.obtained_return is not None:
+        targets = jnp.maximum(targets, block.obtained_return[None])
+
+    def loss(critics: Params) -> tuple[Array, Metrics]:
+        quantiles = apply_critics(critics, block.inputs, block.action, config)
+        errors = quantile_huber(quantiles, targets) if config.base == "tqc" else squared_error(quantiles[:, 0], targets[0])
+        value = jnp.mean(errors)
+        return value, {"critic/loss": value, "critic/value": jnp.mean(quantiles), "critic/target": jnp.mean(targets)}
+
+    return jax.grad(loss, has_aux=True)(state.critics)
+
+
+def _next_action(state: AgentState, config: AgentConfig, block: _Columns) -> tuple[Array, Array]:
+    """The actions (A, B) that the targets assume at the ends of the transitions, and the bonus (B,) for their entropy."""
+    action_dim = block.action.shape[0]
+    if config.has_entropy:
+        action, log_prob = apply_actor(state.actor, block.next_inputs, config, action_dim=action_dim).at(block.next_noise)
+        return action, -jnp.exp(state.log_alpha) * log_prob
+    action = apply_actor(state.target_actor, block.next_inputs, config, action_dim=action_dim).mode
+    if config.base == "td3":
+        noise = jnp.clip(config.target_noise * block.next_noise, -config.target_noise_clip, config.target_noise_clip)
+        action = jnp.clip(action + noise, -1.0, 1.0)
+    return action, jnp.zeros(action.shape[1])
+
+
+def _value(critics: Params, inputs: Array, action: Array, config: AgentConfig) -> Array:
+    """What the actor climbs: (B,)."""
+    if config.base == "tqc":
+        return mean_return(critics, inputs, action, config)
+    if config.base == "sac":
+        return jnp.min(apply_critics(critics, inputs, action, config)[:, 0], axis=0)
+    return apply_critics(jax.tree.map(lambda leaf: leaf[:1], critics), inputs, action, config)[0, 0]
+
+
+def _actor_gradient(state: AgentState, schedule: Schedule, config: AgentConfig, block: _Columns) -> tuple[Params, Metrics]:
+    """The gradient of the actor's loss over a block, and metrics."""
+
+    def loss(actor: Params) -> tuple[Array, Metrics]:
+        distribution = apply_actor(actor, block.inputs, config, action_dim=block.action.shape[0])
+        action, log_prob = distribution.at(block.noise)
+        if not config.has_entropy:
+            action, log_prob = distribution.mode, jnp.zeros(block.reward.shape)
+        values = _value(state.critics, block.inputs, action, config)
+        value, entropy = jnp.mean(values), -jnp.mean(log_prob)
+        size = jax.lax.stop_gradient(jnp.mean(jnp.abs(values))) if config.normalise_value else 1.0
+        cloned = distribution.mode if config.bc_action == "mean" else action
+        clonable = block.is_demonstration
+        if config.q_filter:
+            own = _value(state.critics, block.inputs, jax.lax.stop_gradient(distribution.mode), config)
+            clonable &= _value(state.critics, block.inputs, block.action, config) > own
+        bc = behaviour_cloning(cloned, block.action, clonable, form=config.bc_loss)
+        total = -jnp.exp(state.log_alpha) * entropy - value / size + schedule.bc_weight * bc
+        return total, {"actor/loss": total, "actor/bc_loss": bc, "actor/value": value, "actor/entropy": entropy}
+
+    return jax.grad(loss, has_aux=True)(state.actor)
+
+
+def _move_actor(state: AgentState, gradient: Params, entropy: Array, schedule: Schedule, config: AgentConfig) -> tuple[AgentState, Metrics]:
+    """The actor's step, and that of what depends on it: its average, its target and the entropy coefficient."""
+    actor, actor_optimiser = _descend(gradient, state.actor_optimiser, state.actor, schedule.learning_rate, max_norm=config.max_gradient_norm)
+    state = state.replace(
+        actor=actor,
+        actor_optimiser=actor_optimiser,
+        average_actor=optax.incremental_update(actor, state.average_actor, schedule.actor_average_rate),
+    )
+    if not config.has_entropy:
+        return state.replace(target_actor=optax.incremental_update(actor, state.target_actor, config.target_update_rate)), {}
+    loss, gradient = jax.value_and_grad(entropy_coefficient)(state.log_alpha, -entropy, target_entropy=schedule.target_entropy)
+    log_alpha, alpha_optimiser = _descend(gradient, state.alpha_optimiser, state.log_alpha, schedule.learning_rate)
+    metrics = {"alpha/loss": loss, "alpha/value": jnp.exp(state.log_alpha)}
+    return state.replace(log_alpha=log_alpha, alpha_optimiser=alpha_optimiser), metrics
 
 
 def update_bc(state: AgentState, batch: Transition, *, inputs: Array, schedule: Schedule, config: AgentConfig) -> tuple[AgentState, Metrics]:

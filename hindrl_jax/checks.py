@@ -29,7 +29,8 @@ def _matches(value: object, hint: Any) -> bool:
     if origin is UnionType:
         return any(_matches(value, argument) for argument in arguments)
     if origin is tuple:
-        return isinstance(value, tuple) and all(_matches(item, arguments[0]) for item in value)
+        hints = arguments[:1] * len(value) if isinstance(value, tuple) and arguments[-1] is Ellipsis else arguments
+        return isinstance(value, tuple) and len(value) == len(hints) and all(map(_matches, value, hints))
     if hint is float:
         return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
     return isinstance(value, hint) and (hint is bool or not isinstance(value, bool))
@@ -42,5 +43,5 @@ def _in_words(hint: Any) -> str:
     if origin is UnionType:
         return " or ".join(_in_words(argument) for argument in arguments)
     if origin is tuple:
-        return "a list of whole numbers"
+        return f"a list, each item {_in_words(arguments[0])}" if arguments[-1] is Ellipsis else f"({', '.join(map(_in_words, arguments))})"
     return {int: "a whole number", float: "a finite number", bool: "true or false", type(None): "none"}.get(hint, f"a {hint.__name__}")

@@ -14,8 +14,10 @@ from typing import Any, Literal
 from hindrl_jax.checks import check, check_types
 
 Algorithm = Literal["bc", "tqcfd", "hindrl", "smooth-hindrl"]
-Strategy = Literal["final", "future", "rollout_conditioned", "episode", "task_conditioned", "joint_union"]
-"""Hindsight strategies, explained in `hindrl_jax.relabel`."""
+Source = Literal["final", "future", "episode", "random", "task_conditioned", "joint_intersection"]
+"""Where a relabelled goal may come from, explained in `hindrl_jax.relabel`."""
+Strategy = Literal["final", "future", "rollout_conditioned", "episode", "random", "task_conditioned", "joint_union", "joint_intersection", "mixture"]
+"""Hindsight strategies: one of the sources, or a mixture of them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,10 +36,16 @@ class BatchConfig:
     """Where relabelled goals come from; rollout_conditioned is the thesis's name for future."""
     union_sampling_ratio: float = 0.5
     """For joint_union: the share of relabelled goals that comes from the demonstrations."""
+    intersection_goals: Literal["rollout", "demonstrations"] = "rollout"
+    """For joint_intersection: goals that the rollout reached within epsilon of a demonstrated one, or the demonstrated ones that it came near."""
+    strategy_mixture: tuple[tuple[Source, float], ...] = ()
+    """For mixture: the sources of goals and their weights, as in future 0.5 random 0.2 task_conditioned 0.3."""
     n_step: int = 5
     """Steps of reward before the value estimate takes over."""
     gamma: float = 0.98
     """Discount factor."""
+    demo_returns: Literal["n_step", "monte_carlo"] = "n_step"
+    """Returns of demonstration rows: over n_step steps, as those of all rows, or all the way to the demonstration's end."""
     inclusive_goal_test: bool = True
     """A goal counts as reached at distance <= epsilon; false gives the strict < of the thesis's formula and code."""
     terminate_on_relabel: bool = True
@@ -59,9 +67,18 @@ class BatchConfig:
             reach_zero=(self.reach_zero is None or self.reach_zero >= 1, "at least 1 environment step, or None"),
             num_sampled_goals=(self.num_sampled_goals >= 0, "0 (no relabelling) or more"),
             union_sampling_ratio=(0.0 <= self.union_sampling_ratio <= 1.0, "between 0 and 1"),
+            strategy_mixture=(
+                all(weight > 0.0 for _, weight in self.strategy_mixture) and len(dict(self.strategy_mixture)) == len(self.strategy_mixture),
+                "sources that differ, with weights greater than 0",
+            ),
             n_step=(self.n_step >= 1, "at least 1"),
             gamma=(0.0 < self.gamma <= 1.0, "in (0, 1]"),
         )
+        if (self.hindrl_sampling_strategy == "mixture") != bool(self.strategy_mixture):
+            raise ValueError(
+                f"strategy_mixture = {self.strategy_mixture!r} and hindrl_sampling_strategy = {self.hindrl_sampling_strategy!r} do not belong "
+                "together: give both mixture and its parts, or neither"
+            )
         if self.batch_size - self.max_demo_rows < 1:
             raise ValueError(
                 f"max_demo_ratio = {self.max_demo_ratio} of batch_size = {self.batch_size} leaves no replay row: "
@@ -72,6 +89,15 @@ class BatchConfig:
     def max_demo_rows(self) -> int:
         """Number of demonstration rows at the start of training."""
         return int(self.max_demo_ratio * self.batch_size)
+
+    @property
+    def sources(self) -> tuple[tuple[Source, Any], ...]:
+        """The sources of relabelled goals and their weights, which need not sum to 1; none if nothing is relabelled."""
+        if self.num_sampled_goals == 0:
+            return ()
+        if self.hindrl_sampling_strategy == "joint_union":
+            return ("task_conditioned", self.union_sampling_ratio), ("future", 1.0 - self.union_sampling_ratio)
+        return self.strategy_mixture or ((self.hindrl_sampling_strategy, 1.0),)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,6 +112,11 @@ class GoalConfig:
     """Drop demonstration goals that lie within epsilon of the last kept one (thesis algorithm 6, Smooth HinDRL)."""
     behavioural_goals: Literal["final_demonstration_states", "task"] = "final_demonstration_states"
     """Goal of a rollout: the end of a random demonstration (thesis algorithm 5), or the task's one constant goal (original code)."""
+    achieved_goal_ratio: float = 0.0
+    """Share of training episodes with another behavioural goal: a state reached earlier in training, whatever the task (thesis chapter 6). They
+    are rewarded, when drawn, for reaching that goal. Evaluations never have one."""
+    final_achieved_goal_ratio: float | None = None
+    """Where that share has moved, linearly, by the end of the run; None keeps it constant."""
     exclude_last_goal: bool = False
     """Never draw the last goal of a demonstration, as the original code does by mistake."""
     rescale_demo_actions: bool = True
@@ -95,13 +126,30 @@ class GoalConfig:
 
     def __post_init__(self) -> None:
         check_types(self)
-        check(self, m=(self.m >= 0, "0 or more"), k=(self.k >= 0.0, "0 or more"))
+        check(
+            self,
+            m=(self.m >= 0, "0 or more"),
+            k=(self.k >= 0.0, "0 or more"),
+            achieved_goal_ratio=(0.0 <= self.achieved_goal_ratio <= 1.0, "between 0 and 1"),
+            final_achieved_goal_ratio=(
+                self.final_achieved_goal_ratio is None or 0.0 <= self.final_achieved_goal_ratio <= 1.0,
+                "between 0 and 1, or None",
+            ),
+        )
+
+    @property
+    def has_achieved_goals(self) -> bool:
+        """Whether some training episodes have a behavioural goal that was achieved earlier."""
+        return self.achieved_goal_ratio > 0.0 or bool(self.final_achieved_goal_ratio)
 
 
 @dataclasses.dataclass(frozen=True)
 class AgentConfig:
     """Truncated quantile critics, the actor, and how both are trained."""
 
+    base: Literal["tqc", "sac", "td3", "ddpg"] = "tqc"
+    """The algorithm below the demonstrations: truncated quantile critics, soft actor-critic (Haarnoja et al., 2018), TD3 (Fujimoto et al., 2018;
+    there with actor_delay 2) or DDPG (Lillicrap et al., 2016; with one critic). Only tqc has quantiles, only tqc and sac have entropy."""
     net_arch: tuple[int, ...] = (64, 64, 64, 64)
     """Widths of the hidden layers, the same for actor and critics."""
     layer_norm: bool = False
@@ -116,7 +164,9 @@ class AgentConfig:
     """Clip the critics' targets to [0, 1], which holds every return where the one reward of an episode is 1 and ends it (Andrychowicz et al.,
     hindsight experience replay, 2017)."""
     num_critics: int = 2
-    """Number of quantile critics."""
+    """Number of critics."""
+    num_target_critics: int | None = None
+    """Target critics drawn at random for each gradient step (REDQ; Chen et al., 2021); None takes all."""
     num_quantiles: int = 25
     """Quantiles per critic."""
     top_quantiles_to_drop_per_net: int = 2
@@ -133,8 +183,25 @@ class AgentConfig:
     """Entropy that the automatic tuning aims at, in nats; None means minus the number of action dimensions."""
     final_target_entropy: float | None = -10.0
     """Where the target entropy has moved, linearly, by the end of the run; None keeps it constant."""
+    actor_delay: int = 1
+    """Gradient steps of the critics for each one of the actor and the entropy coefficient (TD3's delayed policy updates)."""
+    max_gradient_norm: float | None = None
+    """Longer gradients are shortened to this length, those of the actor and of the critics each as a whole; None leaves them."""
+    exploration_noise: float = 0.1
+    """For td3 and ddpg: standard deviation of the noise on the actions of rollouts, which lie in [-1, 1]."""
+    target_noise: float = 0.2
+    """For td3: standard deviation of the noise on the actions of the targets."""
+    target_noise_clip: float = 0.5
+    """For td3: the largest noise on the actions of the targets."""
+    normalise_value: bool = False
+    """Divide the value in the actor's loss by its mean size over the batch, so that bc_weight weighs alike whatever the values are (TD3+BC,
+    Fujimoto and Gu, 2021)."""
     bc_weight: float = 0.01
     """Weight of the behaviour cloning loss on demonstration rows (lambda_BC of the thesis)."""
+    final_bc_weight: float | None = None
+    """Where that weight has moved, linearly, by the end of the run; None keeps it constant."""
+    q_filter: bool = False
+    """Clone only the demonstrated actions that the critics value above the policy's own (Nair et al., 2018, eq. 4)."""
     bc_loss: Literal["squared", "norm"] = "squared"
     """Squared distance to the demonstrated action (thesis), or its square root per row (original code)."""
     bc_action: Literal["mean", "sample"] = "mean"
@@ -153,6 +220,10 @@ class AgentConfig:
             learning_rate=(self.learning_rate > 0.0, "greater than 0"),
             final_learning_rate=(self.final_learning_rate is None or self.final_learning_rate >= 0.0, "0 or more, or None"),
             num_critics=(self.num_critics >= 1, "at least 1"),
+            num_target_critics=(
+                self.num_target_critics is None or 1 <= self.num_target_critics <= self.num_critics,
+                f"between 1 and num_critics = {self.num_critics}, or None",
+            ),
             num_quantiles=(self.num_quantiles >= 1, "at least 1"),
             top_quantiles_to_drop_per_net=(
                 0 <= self.top_quantiles_to_drop_per_net < self.num_quantiles,
@@ -162,8 +233,26 @@ class AgentConfig:
             actor_average_rate=(0.0 < self.actor_average_rate <= 1.0, "in (0, 1]; 1 means no averaging"),
             actor_average_span=(self.actor_average_span >= 0.0, "0 or more"),
             initial_alpha=(self.initial_alpha > 0.0, "greater than 0"),
+            actor_delay=(self.actor_delay >= 1, "at least 1"),
+            max_gradient_norm=(self.max_gradient_norm is None or self.max_gradient_norm > 0.0, "greater than 0, or None"),
+            exploration_noise=(self.exploration_noise >= 0.0, "0 or more"),
+            target_noise=(self.target_noise >= 0.0, "0 or more"),
+            target_noise_clip=(self.target_noise_clip >= 0.0, "0 or more"),
             bc_weight=(self.bc_weight >= 0.0, "0 or more"),
+            final_bc_weight=(self.final_bc_weight is None or self.final_bc_weight >= 0.0, "0 or more, or None"),
         )
+        if self.base == "ddpg" and self.num_critics > 1:
+            raise ValueError(f"ddpg has one critic, but num_critics = {self.num_critics}: set it to 1, or choose td3")
+
+    @property
+    def has_entropy(self) -> bool:
+        """Whether the policy is random and rewarded for it; td3 and ddpg have a deterministic one."""
+        return self.base in ("tqc", "sac")
+
+    @property
+    def critic_outputs(self) -> int:
+        """Numbers that each critic returns: its quantiles, or one value."""
+        return self.num_quantiles if self.base == "tqc" else 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -183,6 +272,14 @@ class TrainConfig:
     demo_reset_ratio: float = 0.0
     """Share of training episodes that begin in a demonstrated state, drawn uniformly, with the steps that it had left (Nair et al., overcoming
     exploration in reinforcement learning with demonstrations, 2018). Evaluations never do."""
+    demo_reset_curriculum: float = 0.0
+    """Share of the run over which those states widen from the end of each demonstration to all of it: a reverse curriculum (RFCL, Tao et al.,
+    2024, widens by success instead). 0 draws from all of them throughout."""
+    bc_warm_start: int = 0
+    """Gradient steps of behaviour cloning alone before the first of reinforcement learning."""
+    pretrain_updates: int = 0
+    """Gradient steps of actor and critics on demonstrations alone, after the warm start and before the first on mixed batches (DQfD, Hester et
+    al., 2018; DDPGfD, Vecerik et al., 2017)."""
     buffer_size: int = 500_000
     """Transitions that the replay holds."""
     eval_every: int = 16_000
@@ -201,7 +298,12 @@ class TrainConfig:
             **{name: (getattr(self, name) >= 1, "at least 1") for name in counts},
             learning_starts=(self.learning_starts >= 0, "0 or more"),
             demo_reset_ratio=(0.0 <= self.demo_reset_ratio <= 1.0, "between 0 and 1"),
+            demo_reset_curriculum=(0.0 <= self.demo_reset_curriculum <= 1.0, "between 0 and 1"),
+            bc_warm_start=(self.bc_warm_start >= 0, "0 or more"),
+            pretrain_updates=(self.pretrain_updates >= 0, "0 or more"),
         )
+        if self.demo_reset_curriculum > 0.0 and self.demo_reset_ratio == 0.0:
+            raise ValueError(f"demo_reset_curriculum = {self.demo_reset_curriculum} is of no use while demo_reset_ratio = 0: raise that, too")
         if self.algo == "tqcfd" and self.batch.num_sampled_goals > 0:
             raise ValueError(f"tqcfd does not relabel, but num_sampled_goals = {self.batch.num_sampled_goals}: set it to 0, or choose hindrl")
         if self.algo == "smooth-hindrl" and not self.goal.epsilon_filtering:
@@ -221,6 +323,7 @@ SWEEPABLE: dict[str, Literal["batch", "goal", "agent"]] = {
     "target_entropy": "agent",
     "final_target_entropy": "agent",
     "bc_weight": "agent",
+    "final_bc_weight": "agent",
 }
 """The fields that only enter arithmetic, and their sections: configs that differ in nothing else share one compiled program."""
 
@@ -234,6 +337,8 @@ def without_effect(config: TrainConfig, name: str) -> str | None:
     """Why changing a field of `SWEEPABLE` would change nothing in this config, and what to do; None if it does have an effect."""
     if config.algo == "bc" and name not in ("learning_rate", "final_learning_rate", "actor_average_rate", "actor_average_span"):
         return "behaviour cloning does not use it: choose another algo"
+    if name in ("initial_alpha", "target_entropy", "final_target_entropy") and not config.agent.has_entropy:
+        return f"{config.agent.base} has no entropy coefficient: choose --base tqc or sac"
     relabelled = config.batch.num_sampled_goals > 0
     if name == "union_sampling_ratio" and not (relabelled and config.batch.hindrl_sampling_strategy == "joint_union"):
         return "only relabelling by joint_union uses it: choose --hindrl-sampling-strategy joint_union"

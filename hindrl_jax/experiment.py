@@ -217,6 +217,9 @@ def fit(
     if config.algo != "bc":
         result.state = jax.block_until_ready(programs.collect(result.state, guidance, values))
         result.env_steps = programs.warm_up * config.num_envs
+        if programs.pretrain is not None:
+            result.state = jax.block_until_ready(programs.pretrain(result.state, guidance, values))
+            result.updates = config.bc_warm_start + config.pretrain_updates
     chunks_metrics: list[dict[str, np.ndarray]] = []
     next_evaluation = result.steps_done + config.eval_every
     while result.steps_done < config.steps:
@@ -317,6 +320,9 @@ class _Programs:
         def collect(state: TrainState, guidance: Guidance, values: dict[str, Array]) -> TrainState:
             return training.collect(state, guidance, env=env, config=with_traced_values(config, values), num_iterations=self.warm_up)
 
+        def pretrain(state: TrainState, guidance: Guidance, values: dict[str, Array]) -> TrainState:
+            return training.pretrain(state, guidance, env=env, config=with_traced_values(config, values))
+
         def learn(state: TrainState, guidance: Guidance, values: dict[str, Array]) -> tuple[TrainState, Metrics]:
             iterate = training.clone if cloning else training.learn
             return iterate(state, guidance, env=env, config=with_traced_values(config, values), num_iterations=self.chunk)
@@ -344,7 +350,10 @@ class _Programs:
                 for num_episodes in {config.eval_episodes, FRESH_EPISODES}
             }
             collecting = None if cloning else compiled(program(collect, donate=True).trace(state, guidance, values), _RUN_ONCE)
+            pretrains = not cloning and config.bc_warm_start + config.pretrain_updates > 0
+            pretraining = compiled(program(pretrain, donate=True).trace(state, guidance, values)) if pretrains else None
         self.start, self.learn, self.collect = starting.result(), learning.result(), collecting and collecting.result()
+        self.pretrain = pretraining and pretraining.result()
         self.evaluate, self.evaluate_fresh = evaluating[config.eval_episodes].result(), evaluating[FRESH_EPISODES].result()
 
 

@@ -142,3 +142,29 @@ def constant_goal(goal: Array) -> GoalTable:
 def sample_goals(key: Array, table: GoalTable, num_goals: int) -> Array:
     """Draws goals uniformly, with replacement, from the table (thesis eq. 4.2): (num_goals, G)."""
     return table.goals[uniform_index(key, (num_goals,), table.count)]
+
+
+def nearby_goal(key: Array, table: GoalTable, achieved_goals: Array, epsilon: Array, *, inclusive: bool = True) -> Array:
+    """Picks, for each achieved goal, one of the table's goals in whose box it lies, uniformly.
+
+    Args:
+      key: random key; the choices of one call use the same random order of the table.
+      table: M rows.
+      achieved_goals: (E, G).
+      epsilon: (G,) half-width of the goal box.
+      inclusive: which box test, see `goal_reached`.
+
+    Returns:
+      (E,) int32 row of the table, -1 where no goal is near.
+    """
+    num_goals = table.goals.shape[0]
+    index_bits = max(num_goals.bit_length(), 1)
+    row = jnp.arange(num_goals, dtype=jnp.uint32)
+    # The row's number plus 1, below random bits: the maximum over rows is a random row, and says which.
+    label = (jax.random.bits(key, (num_goals,)) << index_bits) | (row + 1)
+    label = jnp.where(row < table.count, label, 0)
+    near = jnp.ones((achieved_goals.shape[0], num_goals), bool)
+    for goal, reference, width in zip(achieved_goals.T, table.goals.T, epsilon, strict=True):  # dimension by dimension, over long rows
+        near &= goal_reached(goal[:, None, None], reference[None, :, None], width[None], inclusive=inclusive)
+    chosen = jnp.max(jnp.where(near, label[None], 0), axis=1)
+    return (chosen & jnp.uint32(2**index_bits - 1)).astype(jnp.int32) - 1

@@ -150,12 +150,38 @@ def target_atoms(next_atoms: Array, *, reward: Array, discount: Array, entropy_b
     return jax.lax.stop_gradient(reward[None] + discount[None] * (kept + entropy_bonus[None]))
 
 
+def target_value(next_values: Array, *, reward: Array, discount: Array, entropy_bonus: Array | float) -> Array:
+    """The target of algorithms without quantiles: r + discount * (min over critics of the next value + bonus).
+
+    Clipped double Q-learning (Fujimoto et al., TD3, 2018, eq. 10), with the bonus of SAC; with one critic the target of DDPG.
+
+    Args:
+      next_values: (N, B) values of the target critics at the next state and action.
+      reward, discount: (B,); the discount is 0 after termination.
+      entropy_bonus: (B,) minus alpha times the log-probability of the next action; 0 for deterministic policies.
+
+    Returns:
+      (1, B), without gradient.
+
+    Example:
+      >>> target_value(jnp.array([[4.0], [2.0]]), reward=jnp.ones(1), discount=jnp.full(1, 0.5), entropy_bonus=0.0).tolist()
+      [[2.0]]
+    """
+    target = reward + discount * (jnp.min(next_values, axis=0) + entropy_bonus)
+    return jax.lax.stop_gradient(target[None])
+
+
+def squared_error(values: Array, target: Array) -> Array:
+    """Half the squared distance of values (..., B) to a target (B,), which gets no gradient: (..., B)."""
+    return 0.5 * jnp.square(values - jax.lax.stop_gradient(target).reshape((1,) * (values.ndim - 1) + target.shape))
+
+
 def behaviour_cloning(policy_action: Array, demonstrated_action: Array, is_demonstration: Array, *, form: Literal["squared", "norm"]) -> Array:
     """Behaviour cloning loss: masked by "is a demonstration row", divided by the whole batch (thesis eq. 2.32).
 
     Args:
       policy_action, demonstrated_action: (A, B) in [-1, 1].
-      is_demonstration: (B,) bool, the mask delta^e.
+      is_demonstration: (B,) bool, the mask delta^e; of these, with a Q-filter, those that pass it.
       form: "squared" for the squared distance (thesis text), "norm" for the distance itself (original code).
 
     Returns:

@@ -120,7 +120,7 @@ def init_actor(key: Array, config: AgentConfig, *, input_dim: int, action_dim: i
 def init_critics(key: Array, config: AgentConfig, *, input_dim: int, action_dim: int) -> Params:
     """Parameters of the N critics, stacked along the leading axis of every leaf."""
     keys = jax.random.split(key, config.num_critics)
-    return jax.vmap(lambda key: _critic(config, config.num_quantiles).init(key, jnp.zeros((input_dim + action_dim, 1))))(keys)
+    return jax.vmap(lambda key: _critic(config, config.critic_outputs).init(key, jnp.zeros((input_dim + action_dim, 1))))(keys)
 
 
 def apply_actor(params: Params, inputs: Array, config: AgentConfig, *, action_dim: int) -> ActionDistribution:
@@ -133,13 +133,17 @@ def _apply_each(params: Params, inputs: Array, action: Array, config: AgentConfi
     # One critic after the other: as one batched product they are slower on a CPU.
     joint = jnp.concatenate([inputs, action], axis=0)
     critic = _critic(config, out_dim)
-    members = [jax.tree.map(lambda leaf, n=n: leaf[n], params) for n in range(config.num_critics)]
+    num_critics = jax.tree.leaves(params)[0].shape[0]
+    members = [jax.tree.map(lambda leaf, n=n: leaf[n], params) for n in range(num_critics)]
     return jnp.stack([critic.apply(member, joint) for member in members])
 
 
 def apply_critics(params: Params, inputs: Array, action: Array, config: AgentConfig) -> Array:
-    """Quantiles of the return at inputs (input_dim, B) and actions (A, B): (N, Q, B)."""
-    return _apply_each(params, inputs, action, config, config.num_quantiles)
+    """Quantiles of the return at inputs (input_dim, B) and actions (A, B): (N, Q, B); for algorithms without quantiles Q is 1.
+
+    N is that of the parameters, which may be a subset of the critics.
+    """
+    return _apply_each(params, inputs, action, config, config.critic_outputs)
 
 
 def mean_return(params: Params, inputs: Array, action: Array, config: AgentConfig) -> Array:

@@ -15,11 +15,11 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from hindrl_jax.config import BatchConfig
+from hindrl_jax.config import BatchConfig, Source
 from hindrl_jax.errors import UserError
-from hindrl_jax.goals import GoalTable, goal_reached
+from hindrl_jax.goals import GoalTable, goal_reached, sample_goals
 from hindrl_jax.randomness import uniform_index
-from hindrl_jax.relabel import hindsight_steps, relabelled_goals
+from hindrl_jax.relabel import choose_sources, hindsight_steps, intersection_steps
 from hindrl_jax.types import Array, Episodes, Transition
 
 
@@ -31,9 +31,13 @@ class ReplayState:
     slot: Array  # (E,) int32, the slot that each environment is writing
     step: Array  # (E,) int32, transitions already written there
     num_complete: Array  # (E,) int32, complete episodes in each ring, at most R - 1
+    judged_by_goal: Array  # (E * R,) bool, whether an episode is rewarded for reaching its behavioural goal rather than by the environment
+    nearby_goals: Array | None  # (E * R, T + 1) int32, for each state but the first a row of the goal table near it, or -1; None if not kept
 
 
-def init(*, num_envs: int, capacity: int, horizon: int, observation_dim: int, action_dim: int, goal_dim: int) -> ReplayState:
+def init(
+    *, num_envs: int, capacity: int, horizon: int, observation_dim: int, action_dim: int, goal_dim: int, keep_nearby_goals: bool = False
+) -> ReplayState:
     """An empty replay.
 
     Args:
@@ -41,6 +45,7 @@ def init(*, num_envs: int, capacity: int, horizon: int, observation_dim: int, ac
       capacity: transitions to hold; rounded down to whole episodes of `horizon` steps per environment.
       horizon: T, the longest episode.
       observation_dim, action_dim, goal_dim: D, A, G.
+      keep_nearby_goals: whether `add` will be given nearby goals, which the source joint_intersection needs.
 
     Raises:
       UserError: if the capacity is below two episodes per environment (one being written, one to sample).
@@ -64,6 +69,8 @@ def init(*, num_envs: int, capacity: int, horizon: int, observation_dim: int, ac
         slot=jnp.zeros(num_envs, jnp.int32),
         step=jnp.zeros(num_envs, jnp.int32),
         num_complete=jnp.zeros(num_envs, jnp.int32),
+        judged_by_goal=jnp.zeros(rows, bool),
+        nearby_goals=jnp.full((rows, horizon + 1), -1) if keep_nearby_goals else None,
     )
 
 
@@ -77,6 +84,8 @@ def add(
     next_observation: Array,
     terminated: Array,
     truncated: Array,
+    judged_by_goal: Array,
+    nearby_goal: Array | None = None,
 ) -> ReplayState:
     """Appends one transition per environment; an episode becomes available for sampling when it ends.
 
@@ -87,6 +96,8 @@ def add(
       action: (E, A) in [-1, 1].
       reward: (E,).
       terminated, truncated: (E,) bool, not both.
+      judged_by_goal: (E,) bool, constant within an episode, see `ReplayState`.
+      nearby_goal: (E,) int32, see `goals.nearby_goal`, of the goal achieved by the next observation; where it is kept.
 
     Returns:
       The new state. The caller donates the old one.
@@ -108,6 +119,8 @@ def add(
         slot=jnp.where(ended, (replay.slot + 1) % slots, replay.slot),
         step=jnp.where(ended, 0, step + 1),
         num_complete=jnp.minimum(replay.num_complete + ended, slots - 1),
+        judged_by_goal=replay.judged_by_goal.at[row].set(judged_by_goal),
+        nearby_goals=None if replay.nearby_goals is None else replay.nearby_goals.at[row, step + 1].set(nearby_goal),
     )
 
 
@@ -139,6 +152,7 @@ def transitions(
     relabelled: Array,
     epsilon: Array,
     is_demonstration: bool,
+    n_step: int,
     config: BatchConfig,
 ) -> Transition:
     """Reads n-step transitions, with the goals and rewards that they were told or have lived.
@@ -155,7 +169,8 @@ def transitions(
       relabelled: (B,) bool.
       epsilon: (G,) half-width of the goal box.
       is_demonstration: marks the rows for the behaviour cloning loss.
-      config: n_step, gamma and the rules of termination.
+      n_step: the largest number of steps of a return.
+      config: gamma and the rules of termination.
 
     Returns:
       The batch. Where the return ended by termination the discount is 0, else gamma to the number of steps taken.
@@ -163,7 +178,7 @@ def transitions(
     lengths, terminated = episodes.lengths[rows], episodes.terminated[rows]
     if config.timeouts_are_terminal:
         terminated = jnp.ones_like(terminated)
-    window = steps[:, None] + jnp.arange(config.n_step)[None]  # (B, n)
+    window = steps[:, None] + jnp.arange(n_step)[None]  # (B, n)
     inside = window < lengths[:, None]
     window = jnp.minimum(window, lengths[:, None] - 1)
     rewards = episodes.rewards[rows[:, None], window]
@@ -178,7 +193,7 @@ def transitions(
     ended_before = jnp.cumsum(ends, axis=1) - ends > 0
     counted = inside & ~ended_before
     num_steps = jnp.sum(counted, axis=1)  # (B,), at least 1
-    discounts = config.gamma ** jnp.arange(config.n_step, dtype=jnp.float32)
+    discounts = config.gamma ** jnp.arange(n_step, dtype=jnp.float32)
     last = (num_steps - 1)[:, None]
     return Transition(
         observation=episodes.observations[rows, steps],
@@ -188,6 +203,7 @@ def transitions(
         next_observation=jnp.take_along_axis(next_observations, last[..., None], axis=1)[:, 0],
         desired_goal=jnp.where(relabelled[:, None], new_goals, episodes.desired_goals[rows]),
         is_demonstration=jnp.full(rows.shape, is_demonstration),
+        is_relabelled=relabelled,
         obtained_return=_obtained_return(episodes, rows, steps, relabelled, config) if config.bound_by_obtained_return else None,
     )
 
@@ -207,6 +223,42 @@ def num_demo_rows(env_steps: Array, config: BatchConfig) -> Array:
     return jnp.minimum(jnp.floor(config.max_demo_ratio * config.batch_size * remaining).astype(jnp.int32), config.max_demo_rows)
 
 
+def _new_goals(
+    key: Array, replay: ReplayState, rows: Array, steps: Array, table: GoalTable, *, achieved_goal: Callable[[Array], Array], config: BatchConfig
+) -> tuple[Array, Array]:
+    """(B, G) goals from the sources of the config, and (B,) whether there was one: only an intersection can be empty."""
+    lengths, size = replay.episodes.lengths, rows.shape[0]
+    sources, weights = zip(*config.sources, strict=True)
+    key_choice, *keys = jax.random.split(key, len(sources) + 1)
+
+    def reached(rows: Array, steps: Array) -> Array:
+        return achieved_goal(replay.episodes.observations[rows, steps])
+
+    def goals_from(key: Array, source: Source) -> tuple[Array, Array]:
+        always = jnp.ones(size, bool)
+        key_row, key_step = jax.random.split(key)
+        if source == "task_conditioned":
+            return sample_goals(key_row, table, size), always
+        if source == "random":
+            others = sample_episodes(key_row, replay, size)
+            return reached(others, hindsight_steps(key_step, jnp.zeros_like(others), lengths[others], source="episode")), always
+        if source == "joint_intersection":
+            nearby = replay.nearby_goals[rows]
+            chosen, found = intersection_steps(key_step, steps, lengths[rows], nearby >= 0)
+            if config.intersection_goals == "rollout":
+                return reached(rows, chosen), found
+            return table.goals[jnp.take_along_axis(nearby, chosen[:, None], axis=1)[:, 0]], found
+        return reached(rows, hindsight_steps(key_step, steps, lengths[rows], source=source)), always
+
+    choice = choose_sources(key_choice, size, weights)
+    goals, found = goals_from(keys[0], sources[0])
+    for index in range(1, len(sources)):
+        other_goals, other_found = goals_from(keys[index], sources[index])
+        goals = jnp.where((choice == index)[:, None], other_goals, goals)
+        found = jnp.where(choice == index, other_found, found)
+    return goals, found
+
+
 def sample_batch(
     key: Array,
     replay: ReplayState,
@@ -220,13 +272,14 @@ def sample_batch(
 ) -> Transition:
     """Draws the batch of one gradient step: demonstrations, then relabelled replay rows, then replay rows as they were lived.
 
-    Of B rows, `demo_rows` come from the demonstrations; of the rest, n / (n + 1) (rounded down) are relabelled.
+    Of B rows, `demo_rows` come from the demonstrations; of the rest, n / (n + 1) (rounded down) are relabelled, or fewer where intersections are
+    empty.
 
     Args:
       key: random key.
       replay: at least one complete episode.
       demonstrations: N episodes; drawn uniformly by episode, then by step, and never relabelled.
-      table: demonstration goals for the task-conditioned strategies.
+      table: demonstration goals, for the sources that need them.
       achieved_goal: projection of observations (..., D) to goals (..., G).
       epsilon: (G,) half-width of the goal box.
       demo_rows: () int32, see `num_demo_rows`.
@@ -235,7 +288,7 @@ def sample_batch(
     Returns:
       A batch of `config.batch_size` rows in that order.
     """
-    key_demo, key_demo_step, key_episode, key_step, key_hindsight, key_goal = jax.random.split(key, 6)
+    key_demo, key_demo_step, key_episode, key_step, key_goal = jax.random.split(key, 5)
     size, num_demos = config.batch_size, demonstrations.lengths.shape[0]
 
     rows = sample_episodes(key_episode, replay, size)
@@ -245,15 +298,16 @@ def sample_batch(
     index = jnp.arange(size)
     relabelled = (index >= demo_rows) & (index < demo_rows + relabelled_rows)
     new_goals = replay.episodes.desired_goals[rows]
-    strategy = config.hindrl_sampling_strategy
-    if config.num_sampled_goals > 0:
-        if strategy != "task_conditioned":
-            own = "future" if strategy == "joint_union" else strategy
-            own_steps = hindsight_steps(key_hindsight, steps, replay.episodes.lengths[rows], strategy=own)
-            new_goals = achieved_goal(replay.episodes.observations[rows, own_steps])
-        new_goals = relabelled_goals(key_goal, table, new_goals, strategy=strategy, union_sampling_ratio=config.union_sampling_ratio)
+    if config.sources:
+        new_goals, found = _new_goals(key_goal, replay, rows, steps, table, achieved_goal=achieved_goal, config=config)
+        relabelled &= found
     read = dict(achieved_goal=achieved_goal, epsilon=epsilon, config=config)
-    batch = transitions(replay.episodes, rows, steps, new_goals=new_goals, relabelled=relabelled, is_demonstration=False, **read)
+    # A row of an episode that is judged by its behavioural goal is read as if that were a goal chosen in hindsight.
+    new_goals = jnp.where(relabelled[:, None], new_goals, replay.episodes.desired_goals[rows])
+    relabelled |= replay.judged_by_goal[rows]
+    batch = transitions(
+        replay.episodes, rows, steps, new_goals=new_goals, relabelled=relabelled, is_demonstration=False, n_step=config.n_step, **read
+    )
     if config.max_demo_rows == 0:
         return batch
 
@@ -265,6 +319,7 @@ def sample_batch(
         new_goals=demonstrations.desired_goals[demo],
         relabelled=jnp.zeros(demo.shape, bool),
         is_demonstration=True,
+        n_step=demonstrations.rewards.shape[1] if config.demo_returns == "monte_carlo" else config.n_step,
         **read,
     )
     use_demo = index[: config.max_demo_rows] < demo_rows

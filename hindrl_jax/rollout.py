@@ -24,26 +24,35 @@ class RolloutState:
     env_state: Any  # leaves (E, ...)
     observation: Array  # (E, D)
     desired_goal: Array  # (E, G), the behavioural goals
+    judged_by_goal: Array  # (E,) bool, whether the episode is to be rewarded for reaching that goal rather than by the environment
 
 
 @struct.dataclass(kw_only=True)
 class StartTable:
-    """Demonstrated states in which an episode may begin: the first `count` rows."""
+    """Demonstrated states in which an episode may begin: all but the last of each demonstration, where nothing is left to do."""
 
-    states: Array  # (M, S) as vectors, see `RestorableEnvironment`; rows from `count` on are padding
-    count: Array  # () int32
+    states: Array  # (N, T + 1, S) as vectors, see `RestorableEnvironment`; padded
+    lengths: Array  # (N,) int32, number of transitions
 
 
-def start_table(states: Array, lengths: Array) -> StartTable:
-    """All demonstrated states but the last of each demonstration, where nothing is left to do.
+def sample_starts(key: Array, table: StartTable, num_starts: int, *, share: Array | float = 1.0) -> Array:
+    """Draws states uniformly from the last `share` of each demonstration, of which at least one state is left.
 
     Args:
-      states: (N, T + 1, S), padded.
-      lengths: (N,) int32 number of transitions.
+      key: random key.
+      table: N demonstrations.
+      num_starts: how many to draw.
+      share: () in [0, 1].
+
+    Returns:
+      (num_starts, S).
     """
-    usable = (jnp.arange(states.shape[1])[None] < lengths[:, None]).reshape(-1)
-    order = jnp.argsort(~usable, stable=True)
-    return StartTable(states=states.reshape(-1, states.shape[-1])[order], count=jnp.sum(usable))
+    eligible = jnp.clip(jnp.ceil(share * table.lengths).astype(jnp.int32), 1, table.lengths)
+    cumulative = jnp.cumsum(eligible)
+    drawn = uniform_index(key, (num_starts,), cumulative[-1])
+    demo = jnp.searchsorted(cumulative, drawn, side="right", method="compare_all")
+    steps_left = cumulative[demo] - drawn  # 1 .. eligible
+    return table.states[demo, table.lengths[demo] - steps_left]
 
 
 def reset(
@@ -54,6 +63,7 @@ def reset(
     *,
     starts: StartTable | None = None,
     demo_reset_ratio: float = 0.0,
+    demo_reset_share: Array | float = 1.0,
 ) -> RolloutState:
     """Starts `num_envs` episodes, each with a goal drawn from the table (thesis algorithm 5).
 
@@ -63,17 +73,24 @@ def reset(
       behavioural_goals: the table.
       num_envs: E.
       starts: with probability `demo_reset_ratio` an episode begins in one of these states instead of the environment's own.
+      demo_reset_ratio: that probability.
+      demo_reset_share: the share of each demonstration, up to its end, that they are drawn from.
     """
     key_env, key_goal = jax.random.split(key)
     env_state, observation = jax.vmap(env.reset)(jax.random.split(key_env, num_envs))
     if starts is not None:
         key_choice, key_start, key_states = jax.random.split(jax.random.fold_in(key, 2), 3)  # 2: split has used what 0 and 1 give
-        vectors = starts.states[uniform_index(key_start, (num_envs,), starts.count)]
+        vectors = sample_starts(key_start, starts, num_envs, share=demo_reset_share)
         demonstrated = jax.vmap(env.vector_to_state)(jax.random.split(key_states, num_envs), vectors)
         chosen = jax.random.bernoulli(key_choice, demo_reset_ratio, (num_envs,))
         env_state = tree_where(chosen, demonstrated, env_state)
         observation = jax.vmap(env.observe)(env_state)
-    return RolloutState(env_state=env_state, observation=observation, desired_goal=sample_goals(key_goal, behavioural_goals, num_envs))
+    return RolloutState(
+        env_state=env_state,
+        observation=observation,
+        desired_goal=sample_goals(key_goal, behavioural_goals, num_envs),
+        judged_by_goal=jnp.zeros(num_envs, bool),
+    )
 
 
 def step(rollout: RolloutState, restarted: RolloutState, action: Array, env: Environment) -> tuple[RolloutState, TimeStep]:

@@ -121,11 +121,16 @@ def _config_from_dict(config_class: type[Any], data: Any, where: Path) -> Any:
         if dataclasses.is_dataclass(hints[name]):
             values[name] = _config_from_dict(hints[name], value, where)
         else:
-            values[name] = tuple(value) if isinstance(value, list) and get_args(hints[name]) else value
+            values[name] = _tuples(value) if get_args(hints[name]) else value
     try:
         return config_class(**values)
     except ValueError as error:
         raise UserError(f"{where}: {error}") from error
+
+
+def _tuples(value: Any) -> Any:
+    """JSON's lists, also those within lists, as the tuples that they were."""
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 def _refuse_unknown(data: dict[str, Any], known: Any, where: Path) -> None:

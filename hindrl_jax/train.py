@@ -20,6 +20,7 @@ from hindrl_jax.config import TrainConfig
 from hindrl_jax.errors import UserError
 from hindrl_jax.goals import GoalTable
 from hindrl_jax.randomness import uniform_index
+from hindrl_jax.relabel import hindsight_steps
 from hindrl_jax.replay import ReplayState
 from hindrl_jax.rollout import Act, Evaluation, RolloutState, StartTable
 from hindrl_jax.types import Array, Environment, Episodes, Transition, action_to_env
@@ -59,7 +60,7 @@ def guidance(demonstrations: Episodes, env: Environment, config: TrainConfig) ->
     if config.demo_reset_ratio > 0.0:
         if demonstrations.states is None:
             raise UserError(f"demo_reset_ratio = {config.demo_reset_ratio} needs the states of the demonstrations: give them, or set it to 0")
-        starts = rollout.start_table(demonstrations.states, demonstrations.lengths)
+        starts = StartTable(states=demonstrations.states, lengths=demonstrations.lengths)
     demonstrations = demonstrations.replace(states=None)
     goal_config, inclusive = config.goal, config.batch.inclusive_goal_test
     if goal_config.misalign_demo_actions:
@@ -107,17 +108,47 @@ def init(key: Array, data: Guidance, env: Environment, config: TrainConfig) -> T
     smallest = 2 * config.num_envs * env.horizon
     return TrainState(
         agent=agents.init(key_agent, config.agent, **dims),
-        replay=replay.init(num_envs=config.num_envs, capacity=smallest if config.algo == "bc" else config.buffer_size, horizon=env.horizon, **dims),
-        rollout=_new_episodes(key_rollout, data, env, config),
+        replay=replay.init(
+            num_envs=config.num_envs,
+            capacity=smallest if config.algo == "bc" else config.buffer_size,
+            horizon=env.horizon,
+            keep_nearby_goals=_uses_intersections(config),
+            **dims,
+        ),
+        rollout=_new_episodes(key_rollout, data, env, config, 0.0),
         key=key_train,
         env_steps=jnp.asarray(0),
         updates=jnp.asarray(0),
     )
 
 
-def _new_episodes(key: Array, data: Guidance, env: Environment, config: TrainConfig) -> RolloutState:
-    goals, ratio = data.behavioural_goals, config.demo_reset_ratio
-    return rollout.reset(key, env, goals, config.num_envs, starts=data.starts, demo_reset_ratio=ratio)
+def _uses_intersections(config: TrainConfig) -> bool:
+    return "joint_intersection" in dict(config.batch.sources)
+
+
+def _new_episodes(key: Array, data: Guidance, env: Environment, config: TrainConfig, progress: Array | float) -> RolloutState:
+    share = jnp.minimum(progress / config.demo_reset_curriculum, 1.0) if config.demo_reset_curriculum > 0.0 else 1.0
+    starts = dict(starts=data.starts, demo_reset_ratio=config.demo_reset_ratio, demo_reset_share=share)
+    return rollout.reset(key, env, data.behavioural_goals, config.num_envs, **starts)
+
+
+def _with_achieved_goals(
+    key: Array, episodes: RolloutState, past: ReplayState, env: Environment, config: TrainConfig, progress: Array
+) -> RolloutState:
+    """New episodes, a share of which are given a goal from the replay and are judged by it; none before the replay holds an episode."""
+    key_choice, key_row, key_step = jax.random.split(key, 3)
+    num_envs, first, last = config.num_envs, config.goal.achieved_goal_ratio, config.goal.final_achieved_goal_ratio
+    share = first if last is None else first + (last - first) * progress
+    rows = replay.sample_episodes(key_row, past, num_envs)
+    steps = hindsight_steps(key_step, jnp.zeros_like(rows), past.episodes.lengths[rows], source="episode")
+    chosen = jax.random.bernoulli(key_choice, share, (num_envs,)) & (jnp.sum(past.num_complete) > 0)
+    achieved = env.achieved_goal(past.episodes.observations[rows, steps])
+    return episodes.replace(desired_goal=jnp.where(chosen[:, None], achieved, episodes.desired_goal), judged_by_goal=chosen)
+
+
+def _progress(state: TrainState, config: TrainConfig) -> Array:
+    """() share of the run that is over."""
+    return jnp.minimum(state.env_steps / config.steps, 1.0)
 
 
 def warm_up_iterations(env: Environment, config: TrainConfig) -> int:
@@ -137,10 +168,17 @@ def make_policy(actor: Any, scale: InputScale, env: Environment, config: TrainCo
 
 def _interact(key: Array, state: TrainState, data: Guidance, env: Environment, config: TrainConfig, act: Act) -> TrainState:
     """One step of every environment, stored in the replay."""
-    key_act, key_reset = jax.random.split(key)
-    before = state.rollout
+    key_act, key_reset, key_goals, key_nearby = jax.random.split(key, 4)
+    before, progress = state.rollout, _progress(state, config)
     action = act(key_act, before.observation, before.desired_goal)
-    after, time_step = rollout.step(before, _new_episodes(key_reset, data, env, config), action, env)
+    restarted = _new_episodes(key_reset, data, env, config, progress)
+    if config.goal.has_achieved_goals:
+        restarted = _with_achieved_goals(key_goals, restarted, state.replay, env, config, progress)
+    after, time_step = rollout.step(before, restarted, action, env)
+    nearby_goal = None
+    if _uses_intersections(config):
+        achieved, inclusive = env.achieved_goal(time_step.observation), config.batch.inclusive_goal_test
+        nearby_goal = goals.nearby_goal(key_nearby, data.goals, achieved, data.epsilon, inclusive=inclusive)
     stored = replay.add(
         state.replay,
         observation=before.observation,
@@ -150,6 +188,8 @@ def _interact(key: Array, state: TrainState, data: Guidance, env: Environment, c
         next_observation=time_step.observation,
         terminated=time_step.terminated,
         truncated=time_step.truncated,
+        judged_by_goal=before.judged_by_goal,
+        nearby_goal=nearby_goal,
     )
     return state.replace(replay=stored, rollout=after, env_steps=state.env_steps + action.shape[0])
 
@@ -195,50 +235,77 @@ def learn(state: TrainState, data: Guidance, *, env: Environment, config: TrainC
             demo_rows=replay.num_demo_rows(state.env_steps, config.batch),
             config=config.batch,
         )
-        num_updates = config.updates_per_iteration
-        batches = jax.vmap(draw)(jax.random.split(key_batch, num_updates))
-        progress = jnp.minimum(state.env_steps / config.steps, 1.0)
-
-        def gradient_step(carry: tuple[Array, AgentState], update: tuple[Array, Transition]) -> tuple[tuple[Array, AgentState], Metrics]:
-            (key, agent), (index, batch) = carry, update
-            key, key_update = jax.random.split(key)
-            schedule = agents.schedule(progress, state.updates + index, config.agent, action_dim=env.action_dim)
-            inputs = _network_inputs(batch, data.scale, env, config)
-            agent, metrics = agents.update(key_update, agent, batch, **inputs, schedule=schedule, config=config.agent)
-            return (key, agent), metrics
-
-        (_, agent), metrics = jax.lax.scan(gradient_step, (key_updates, state.agent), (jnp.arange(num_updates), batches))
-        return state.replace(agent=agent, updates=state.updates + num_updates), jax.tree.map(jnp.mean, metrics)
+        batches = jax.vmap(draw)(jax.random.split(key_batch, config.updates_per_iteration))
+        return _gradient_steps(key_updates, state, batches, data, env, config)
 
     state, metrics = jax.lax.scan(iteration, state, length=num_iterations)
     return state, jax.tree.map(jnp.mean, metrics)
 
 
+def _gradient_steps(
+    key: Array, state: TrainState, batches: Transition, data: Guidance, env: Environment, config: TrainConfig
+) -> tuple[TrainState, Metrics]:
+    """One gradient step for each of the batches, leaves (number, B, ...), and their mean metrics."""
+    num_updates, progress = batches.reward.shape[0], _progress(state, config)
+
+    def gradient_step(carry: tuple[Array, AgentState], update: tuple[Array, Transition]) -> tuple[tuple[Array, AgentState], Metrics]:
+        (key, agent), (index, batch) = carry, update
+        key, key_update = jax.random.split(key)
+        schedule = agents.schedule(progress, state.updates + index, config.agent, action_dim=env.action_dim)
+        inputs = _network_inputs(batch, data.scale, env, config)
+        agent, metrics = agents.update(key_update, agent, batch, **inputs, schedule=schedule, config=config.agent)
+        return (key, agent), {**metrics, "batch/relabelled": jnp.mean(batch.is_relabelled)}
+
+    (_, agent), metrics = jax.lax.scan(gradient_step, (key, state.agent), (jnp.arange(num_updates), batches))
+    return state.replace(agent=agent, updates=state.updates + num_updates), jax.tree.map(jnp.mean, metrics)
+
+
+def _demonstration_batch(key: Array, data: Guidance, env: Environment, config: TrainConfig) -> Transition:
+    """A batch of demonstration rows alone."""
+    key_demo, key_step = jax.random.split(key)
+    rows = uniform_index(key_demo, (config.batch.batch_size,), data.demonstrations.lengths.shape[0])
+    return replay.transitions(
+        data.demonstrations,
+        rows,
+        replay.sample_steps(key_step, data.demonstrations, rows),
+        achieved_goal=env.achieved_goal,
+        new_goals=data.demonstrations.desired_goals[rows],
+        relabelled=jnp.zeros(rows.shape, bool),
+        epsilon=data.epsilon,
+        is_demonstration=True,
+        n_step=config.batch.n_step,
+        config=config.batch,
+    )
+
+
 def clone(state: TrainState, data: Guidance, *, env: Environment, config: TrainConfig, num_iterations: int) -> tuple[TrainState, Metrics]:
     """`num_iterations` gradient steps of behaviour cloning on demonstration batches; no environment is stepped."""
-    size, num_demos = config.batch.batch_size, data.demonstrations.lengths.shape[0]
 
     def gradient_step(state: TrainState, _: None) -> tuple[TrainState, Metrics]:
-        key, key_demo, key_step = jax.random.split(state.key, 3)
-        rows = uniform_index(key_demo, (size,), num_demos)
-        batch = replay.transitions(
-            data.demonstrations,
-            rows,
-            replay.sample_steps(key_step, data.demonstrations, rows),
-            achieved_goal=env.achieved_goal,
-            new_goals=data.demonstrations.desired_goals[rows],
-            relabelled=jnp.zeros(size, bool),
-            epsilon=data.epsilon,
-            is_demonstration=True,
-            config=config.batch,
-        )
+        key, key_batch = jax.random.split(state.key)
+        batch = _demonstration_batch(key_batch, data, env, config)
         inputs = _network_inputs(batch, data.scale, env, config)["inputs"]
-        schedule = agents.schedule(jnp.minimum(state.updates / config.steps, 1.0), state.updates, config.agent, action_dim=env.action_dim)
+        progress = jnp.minimum(state.updates / config.steps, 1.0) if config.algo == "bc" else 0.0
+        schedule = agents.schedule(progress, state.updates, config.agent, action_dim=env.action_dim)
         agent, metrics = agents.update_bc(state.agent, batch, inputs=inputs, schedule=schedule, config=config.agent)
         return state.replace(agent=agent, key=key, updates=state.updates + 1), metrics
 
     state, metrics = jax.lax.scan(gradient_step, state, length=num_iterations)
     return state, jax.tree.map(jnp.mean, metrics)
+
+
+def pretrain(state: TrainState, data: Guidance, *, env: Environment, config: TrainConfig) -> TrainState:
+    """`bc_warm_start` gradient steps of cloning, then `pretrain_updates` of the whole agent on demonstrations alone."""
+
+    def gradient_step(state: TrainState, _: None) -> tuple[TrainState, None]:
+        key, key_batch, key_update = jax.random.split(state.key, 3)
+        batch = _demonstration_batch(key_batch, data, env, config)
+        batches = jax.tree.map(lambda leaf: leaf[None], batch)
+        return _gradient_steps(key_update, state.replace(key=key), batches, data, env, config)[0], None
+
+    if config.bc_warm_start > 0:
+        state, _ = clone(state, data, env=env, config=config, num_iterations=config.bc_warm_start)
+    return jax.lax.scan(gradient_step, state, length=config.pretrain_updates)[0] if config.pretrain_updates > 0 else state
 
 
 def evaluate(

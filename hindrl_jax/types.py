@@ -55,6 +55,7 @@ class Transition:
     next_observation: Array  # (B, D)
     desired_goal: Array  # (B, G)
     is_demonstration: Array  # (B,) bool
+    is_relabelled: Array  # (B,) bool, whether the goal was chosen in hindsight
     obtained_return: Array | None = None  # (B,), the discounted return that the episode went on to obtain; None where it is not used
 
 

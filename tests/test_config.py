@@ -12,7 +12,14 @@ from hindrl_jax.config import AgentConfig, BatchConfig, GoalConfig, TrainConfig
 SOURCES = [path for path in Path(hindrl_jax.__file__).parent.rglob("*.py") if path.name != "config.py"]
 FIELDS = [(config, field.name) for config in (BatchConfig, GoalConfig, AgentConfig, TrainConfig) for field in dataclasses.fields(config)]
 # Derived in config.py itself and read elsewhere under another name.
-READ_THROUGH = {"max_demo_ratio": "max_demo_rows"}
+READ_THROUGH = {
+    "max_demo_ratio": "max_demo_rows",
+    "hindrl_sampling_strategy": "sources",
+    "union_sampling_ratio": "sources",
+    "strategy_mixture": "sources",
+    "num_quantiles": "critic_outputs",
+    "final_achieved_goal_ratio": "has_achieved_goals",
+}
 
 
 @pytest.fixture(scope="module")
@@ -59,8 +66,11 @@ BAD = [
     (BatchConfig, "max_demo_ratio", [-0.1, 1.1, float("nan"), None, 1.0]),  # 1.0 leaves no replay row
     (BatchConfig, "reach_zero", [0, -5, 0.5]),
     (BatchConfig, "num_sampled_goals", [-1, "4", float("inf")]),
-    (BatchConfig, "hindrl_sampling_strategy", ["joint_intersection", "Future", None]),
+    (BatchConfig, "hindrl_sampling_strategy", ["intersection", "Future", None, "mixture"]),
     (BatchConfig, "union_sampling_ratio", [-0.1, 1.5]),
+    (BatchConfig, "intersection_goals", ["both"]),
+    (BatchConfig, "strategy_mixture", [(("future", 0.0),), (("joint_union", 1.0),), (("future", 1.0, 2.0),), (("future", 1.0),), "future"]),
+    (BatchConfig, "demo_returns", ["mc"]),
     (BatchConfig, "n_step", [0, None]),
     (BatchConfig, "gamma", [0.0, 1.01, float("inf")]),
     (BatchConfig, "inclusive_goal_test", [1, "yes"]),
@@ -71,6 +81,8 @@ BAD = [
     (GoalConfig, "k", [-0.1, float("nan")]),
     (GoalConfig, "epsilon_filtering", [1]),
     (GoalConfig, "behavioural_goals", ["final"]),
+    (GoalConfig, "achieved_goal_ratio", [-0.1, 1.1, None]),
+    (GoalConfig, "final_achieved_goal_ratio", [-0.1, 1.1, "0"]),
     (GoalConfig, "exclude_last_goal", [0]),
     (GoalConfig, "rescale_demo_actions", ["true"]),
     (GoalConfig, "misalign_demo_actions", [1.0]),
@@ -79,7 +91,17 @@ BAD = [
     (AgentConfig, "network_precision", ["float16", 32]),
     (AgentConfig, "learning_rate", [0.0, -1e-3, float("inf"), "1e-3"]),
     (AgentConfig, "clip_targets", [1.0]),
+    (AgentConfig, "base", ["ppo", None]),
     (AgentConfig, "num_critics", [0]),
+    (AgentConfig, "num_target_critics", [0, 3]),
+    (AgentConfig, "actor_delay", [0]),
+    (AgentConfig, "max_gradient_norm", [0.0, "1"]),
+    (AgentConfig, "exploration_noise", [-0.1]),
+    (AgentConfig, "target_noise", [-0.1]),
+    (AgentConfig, "target_noise_clip", [-0.1]),
+    (AgentConfig, "normalise_value", [1]),
+    (AgentConfig, "final_bc_weight", [-1.0, float("nan")]),
+    (AgentConfig, "q_filter", ["yes"]),
     (AgentConfig, "num_quantiles", [0]),
     (AgentConfig, "top_quantiles_to_drop_per_net", [-1, AgentConfig().num_quantiles]),
     (AgentConfig, "target_update_rate", [0.0, 1.1]),
@@ -100,6 +122,9 @@ BAD = [
     (TrainConfig, "updates_per_iteration", [0]),
     (TrainConfig, "learning_starts", [-1]),
     (TrainConfig, "demo_reset_ratio", [-0.1, 1.1, None]),
+    (TrainConfig, "demo_reset_curriculum", [-0.1, 1.1, 0.5]),  # 0.5 without resets to demonstrated states
+    (TrainConfig, "bc_warm_start", [-1, 0.5]),
+    (TrainConfig, "pretrain_updates", [-1, 0.5]),
     (TrainConfig, "buffer_size", [0, 1e6]),
     (TrainConfig, "eval_every", [0]),
     (TrainConfig, "eval_episodes", [0]),

@@ -7,7 +7,17 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from hindrl_jax.goals import constant_goal, epsilon_filter, epsilon_from_demonstrations, final_goals, goal_reached, goal_table, sample_goals
+from hindrl_jax.goals import (
+    GoalTable,
+    constant_goal,
+    epsilon_filter,
+    epsilon_from_demonstrations,
+    final_goals,
+    goal_reached,
+    goal_table,
+    nearby_goal,
+    sample_goals,
+)
 
 # Goals and epsilons are multiples of 1/4, so that every comparison at the edge of a box is exact.
 QUARTERS = st.integers(-8, 8).map(lambda i: i / 4)
@@ -150,3 +160,35 @@ def test_sampled_goals_are_uniform_over_all_goals_and_never_padding():
     assert values.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
     assert counts.min() > 400
     assert counts.max() < 600
+
+
+def nearby_twin(goals, count, achieved, epsilon, *, inclusive):
+    """The rows of the table in whose box a goal lies, as a plain loop."""
+    rows = []
+    for row in range(count):
+        distances = [abs(a - g) for a, g in zip(achieved, goals[row], strict=True)]
+        if all(d <= e if inclusive else d < e for d, e in zip(distances, epsilon, strict=True)):
+            rows.append(row)
+    return rows
+
+
+@pytest.mark.parametrize("inclusive", [True, False])
+@pytest.mark.parametrize("epsilon", [(0.0, 0.0), (1.0, 2.0)])
+def test_nearby_goals_are_those_of_a_plain_loop(epsilon, inclusive):
+    # The cells of a 4 x 4 grid in a table of 16 rows, of which the last three are padding; 40 calls see each candidate with near certainty.
+    goals = np.array([(x, y) for x in range(4) for y in range(4)], np.float32)
+    table = GoalTable(goals=jnp.asarray(goals), count=jnp.asarray(13))
+    achieved = np.array([(0, 0), (2, 2), (3, 3), (9, 9), (1, 3)], np.float32)
+    pick = jax.jit(lambda key: nearby_goal(key, table, jnp.asarray(achieved), jnp.asarray(epsilon), inclusive=inclusive))
+    drawn = np.stack([pick(key) for key in jax.random.split(jax.random.key(0), 300)])
+    for column, goal in zip(drawn.T, achieved, strict=True):
+        assert set(column.tolist()) == set(nearby_twin(goals, 13, goal, epsilon, inclusive=inclusive) or [-1])
+
+
+def test_a_nearby_goal_is_any_of_them_with_equal_chances():
+    # 3 of 5 goals are near; 1500 draws, 500 each, standard deviation 18.
+    table = GoalTable(goals=jnp.array([[0.0], [5.0], [0.5], [6.0], [1.0]]), count=jnp.asarray(5))
+    pick = jax.vmap(lambda key: nearby_goal(key, table, jnp.full((1, 1), 0.5), jnp.array([0.5]))[0])
+    counts = np.bincount(np.asarray(pick(jax.random.split(jax.random.key(1), 1500))), minlength=5)
+    assert counts[[1, 3]].tolist() == [0, 0]
+    assert np.abs(counts[[0, 2, 4]] - 500).max() < 90

@@ -68,7 +68,8 @@ TABLE = GoalTable(goals=jnp.array([*DEMO_STATES, (np.nan,) * 3], jnp.float32), c
 @jax.jit
 def add_all(stream):
     """The replay after each of the steps in `stream`: leaves (NUM_ADDS, ...)."""
-    start = replays.init(num_envs=NUM_ENVS, capacity=NUM_ENVS * HORIZON * SLOTS + 5, horizon=HORIZON, observation_dim=3, action_dim=1, goal_dim=3)
+    dims = dict(horizon=HORIZON, observation_dim=3, action_dim=1, goal_dim=3)
+    start = replays.init(num_envs=NUM_ENVS, capacity=NUM_ENVS * HORIZON * SLOTS + 5, keep_nearby_goals=True, **dims)
 
     def add(state, step):
         state = replays.add(state, **step)
@@ -86,7 +87,7 @@ def replay_history(lengths):
     Returns:
       The replay after each step, and for each step and environment the list of complete episodes: [step][env] -> [length, ...].
     """
-    names = ("observation", "desired_goal", "action", "reward", "next_observation", "terminated", "truncated")
+    names = ("observation", "desired_goal", "action", "reward", "next_observation", "terminated", "truncated", "judged_by_goal", "nearby_goal")
     stream = {name: [] for name in names}
     episode, step, complete, story = [0] * NUM_ENVS, [0] * NUM_ENVS, [[] for _ in range(NUM_ENVS)], []
     for _ in range(NUM_ADDS):
@@ -101,13 +102,16 @@ def replay_history(lengths):
             row["next_observation"].append((env, now, t + 1))
             row["terminated"].append(last and is_terminated(now))
             row["truncated"].append(last and not is_terminated(now))
+            row["nearby_goal"].append(near(env, now, t + 1))
+            row["judged_by_goal"].append(False)
             if last:
                 complete[env].append(length)
             episode[env], step[env] = (now + 1, 0) if last else (now, t + 1)
         for name in names:
             stream[name].append(row[name])
         story.append([list(lengths) for lengths in complete])
-    return add_all({name: np.asarray(rows, bool if name in ("terminated", "truncated") else np.float32) for name, rows in stream.items()}), story
+    kinds = {"terminated": bool, "truncated": bool, "judged_by_goal": bool, "nearby_goal": np.int32}
+    return add_all({name: np.asarray(rows, kinds.get(name, np.float32)) for name, rows in stream.items()}), story
 
 
 def at(history, step):
@@ -191,14 +195,40 @@ def expected_return(state, length, goal, *, relabelled, config):
 
 BATCH = BatchConfig(batch_size=64, max_demo_ratio=0.2, num_sampled_goals=3, gamma=0.5, n_step=2, bound_by_obtained_return=True)
 NUM_DEMO, NUM_RELABELLED = 12, 39  # int(0.2 * 64), (64 - 12) * 3 // 4
-STRATEGIES = ("final", "future", "episode", "task_conditioned", "joint_union")
+STRATEGIES = {
+    "final": {},
+    "future": {},
+    "episode": {},
+    "random": {},
+    "task_conditioned": {},
+    "joint_union": {},
+    "joint_intersection": {},
+    "the other joint_intersection": {"intersection_goals": "demonstrations"},
+    "mixture": {"strategy_mixture": (("final", 1.0), ("random", 2.0), ("joint_intersection", 3.0))},
+}
 
 
-def allowed_goals(strategy, state, length):
+def near(env, episode, step):
+    """The row of TABLE that this test takes for near a state; -1 for every other state."""
+    return (env + 2 * episode + step) % len(DEMO_STATES) if (episode + step) % 2 else -1
+
+
+def allowed_goals(strategy, state, length, sources):
+    """The goals that a relabelled row may get, as plain loops over the states of its own episode, of all episodes held, and of the demonstrations."""
     env, episode, step = state
-    first = {"final": length, "future": step + 1, "joint_union": step + 1, "episode": 0, "task_conditioned": length + 1}[strategy]
-    own = {(env, episode, t) for t in range(first, length + 1)}
-    return own | set(DEMO_STATES) if strategy in ("task_conditioned", "joint_union") else own
+    own, later = [(env, episode, t) for t in range(length + 1)], [(env, episode, t) for t in range(step + 1, length + 1)]
+    close = [other for other in later if near(*other) >= 0]
+    goals = {
+        "final": own[-1:],
+        "future": later,
+        "episode": own,
+        "random": [(*other, t) for other, other_length in sources.items() for t in range(other_length + 1)],
+        "task_conditioned": DEMO_STATES,
+        "joint_union": DEMO_STATES + later,
+        "joint_intersection": close,
+        "the other joint_intersection": [DEMO_STATES[near(*other)] for other in close],
+    }
+    return set(goals["final"] + goals["random"] + goals["joint_intersection"] if strategy == "mixture" else goals[strategy])
 
 
 def triples(array):
@@ -207,7 +237,7 @@ def triples(array):
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_every_row_of_a_batch_comes_from_where_it_should(strategy):
-    config = dataclasses.replace(BATCH, hindrl_sampling_strategy=strategy)
+    config = dataclasses.replace(BATCH, hindrl_sampling_strategy=strategy.split()[-1], **STRATEGIES[strategy])
 
     @hypothesis.settings(deadline=None, max_examples=12)
     @hypothesis.given(lengths=LENGTHS, step=st.integers(HORIZON - 1, NUM_ADDS - 1))
@@ -224,8 +254,10 @@ def test_every_row_of_a_batch_comes_from_where_it_should(strategy):
             length = DEMO_LENGTHS[episode] if row < NUM_DEMO else sources[env, episode]  # a KeyError here: not a complete episode
             assert (env == DEMO) == (row < NUM_DEMO)
             assert t < length
-            relabelled = NUM_DEMO <= row < NUM_DEMO + NUM_RELABELLED
-            assert goal in (allowed_goals(strategy, state, length) if relabelled else {(-1 - env, episode, 0)})
+            allowed = allowed_goals(strategy, state, length, sources) if NUM_DEMO <= row < NUM_DEMO + NUM_RELABELLED else set()
+            relabelled = bool(allowed) if strategy != "mixture" else goal in allowed
+            assert batch.is_relabelled[row] == relabelled
+            assert goal in (allowed if relabelled else {(-1 - env, episode, 0)})
             reward, discount, following = expected_return(state, length, goal, relabelled=relabelled, config=config)
             assert (batch.reward[row], batch.discount[row]) == (reward, discount)  # exact, since gamma = 1/2
             assert batch.obtained_return[row] == (0.0 if relabelled else reward_of(env, episode, length - 1) * 0.5 ** (length - 1 - t))
@@ -245,6 +277,65 @@ def test_union_draws_from_both_sources_and_relabelling_can_be_off():
     assert np.all(np.asarray(batch.desired_goal)[:, 0] < 0)
 
 
+def test_every_part_of_a_mixture_is_drawn_and_empty_intersections_keep_their_rows():
+    # Episodes of 1: state 1 of even episodes is near a demonstrated goal, odd episodes have no intersection.
+    history, _ = replay_history([[1], [1]])
+    config = dataclasses.replace(BATCH, hindrl_sampling_strategy="joint_intersection", batch_size=512)
+    batch = jax.device_get(draw_batch(jax.random.key(0), at(history, 20), NUM_DEMO, config))
+    odd = batch.observation[:, 1] % 2 == 1
+    assert not batch.is_relabelled[odd].any()
+    assert batch.is_relabelled.sum() > 100
+    mixture = (("task_conditioned", 1.0), ("joint_intersection", 1.0))
+    config = dataclasses.replace(config, hindrl_sampling_strategy="mixture", strategy_mixture=mixture)
+    batch = jax.device_get(draw_batch(jax.random.key(0), at(history, 20), NUM_DEMO, config))
+    demonstrated = batch.desired_goal[:, 0] == DEMO
+    assert batch.is_relabelled[demonstrated].all()
+    assert set((batch.observation[demonstrated, 1] % 2).tolist()) == {0, 1}
+    assert (batch.is_relabelled & ~demonstrated).any()
+
+
+def test_monte_carlo_returns_of_demonstrations_go_all_the_way():
+    # n_step is 2, demonstration 0 has 3 steps: from step 0 its return is r0 + r1 / 2 + r2 / 4, and it has ended. Demonstration 1 was cut.
+    history, _ = replay_history([[3], [2]])
+    config = dataclasses.replace(BATCH, demo_returns="monte_carlo")
+    batch = jax.device_get(draw_batch(jax.random.key(0), at(history, 20), NUM_DEMO, config))
+    seen = set()
+    for row, (env, episode, t) in enumerate(triples(batch.observation)):
+        length = DEMO_LENGTHS[episode] if row < NUM_DEMO else 3 - env
+        n_step = HORIZON if row < NUM_DEMO else 2
+        if row < NUM_DEMO or row >= NUM_DEMO + NUM_RELABELLED:
+            plain = dataclasses.replace(config, n_step=n_step)
+            reward, discount, following = expected_return((env, episode, t), length, None, relabelled=False, config=plain)
+            assert (batch.reward[row], batch.discount[row], *batch.next_observation[row]) == (reward, discount, *following)
+            seen.add((row < NUM_DEMO, episode, t))
+    assert (True, 0, 0) in seen
+
+
+@pytest.mark.parametrize("n_step", [1, 2])
+def test_episodes_judged_by_their_goal_are_rewarded_for_reaching_it(n_step):
+    # Environment 0 plays episodes of 3 and means to reach state 2 of them; its rows, relabelled or not, are rewarded for their goal alone.
+    history, _ = replay_history([[3], [3]])
+    replay = at(history, 11)
+    episodes, slots = replay.episodes, SLOTS
+    goals = np.array(episodes.desired_goals)
+    goals[:slots] = episodes.observations[:slots, 2]
+    judged = np.arange(2 * slots) < slots
+    replay = replay.replace(episodes=episodes.replace(desired_goals=goals), judged_by_goal=judged)
+    config = dataclasses.replace(BATCH, num_sampled_goals=0.5, hindrl_sampling_strategy="final", n_step=n_step)
+    batch = jax.device_get(draw_batch(jax.random.key(2), replay, 0, config))
+    kinds = set()
+    for row, (state, goal) in enumerate(zip(triples(batch.observation), triples(batch.desired_goal), strict=True)):
+        env, episode, _ = state
+        in_hindsight = row < 64 // 3
+        assert goal == ((env, episode, 3) if in_hindsight else (0, episode, 2) if env == 0 else (-2, episode, 0))
+        by_goal = in_hindsight or env == 0
+        assert batch.is_relabelled[row] == by_goal
+        reward, discount, following = expected_return(state, 3, goal, relabelled=by_goal, config=config)
+        assert (batch.reward[row], batch.discount[row], *batch.next_observation[row]) == (reward, discount, *following)
+        kinds.add((env, in_hindsight))
+    assert len(kinds) == 4
+
+
 def test_jitted_equals_not_jitted():
     def read(episodes, rows, steps, goals):
         return transitions(
@@ -256,6 +347,7 @@ def test_jitted_equals_not_jitted():
             relabelled=goals[:, 2] < 2,
             epsilon=jnp.zeros(3),
             is_demonstration=False,
+            n_step=BATCH.n_step,
             config=BATCH,
         )
 
@@ -378,6 +470,7 @@ def test_transitions_are_those_of_a_plain_loop(lengths, places, terminated, chos
         relabelled=jnp.asarray(relabelled),
         epsilon=jnp.array([epsilon]),
         is_demonstration=is_demonstration,
+        n_step=config.n_step,
         config=config,
     )
     batch = jax.device_get(batch)
@@ -412,7 +505,8 @@ def test_last_row_of_a_solved_demonstration_is_worth_one_and_ends():
         relabelled=jnp.zeros(6, bool),
         epsilon=jnp.zeros(3),
         is_demonstration=True,
-        config=BatchConfig(n_step=1, gamma=0.5, bound_by_obtained_return=True),
+        n_step=1,
+        config=BatchConfig(gamma=0.5, bound_by_obtained_return=True),
     )
     assert batch.reward.tolist() == [0, 0, 1, 1, 0, 1]
     assert batch.discount.tolist() == [0.5, 0.5, 0, 0, 0.5, 0]

@@ -72,14 +72,26 @@ def test_goal_is_kept_within_an_episode_and_drawn_anew_after_it(played):
     assert set(np.asarray(states.desired_goal)[over][:, 0].tolist()) == {7.0, 8.0, 9.0}
 
 
-def test_start_table_by_hand():
-    # State (episode, t); the episodes have 2, 3 and 1 transitions, and what lies behind their last states is never read.
-    states = np.full((3, 4, 2), np.nan, np.float32)
-    for episode, length in enumerate((2, 3, 1)):
+@pytest.mark.parametrize(
+    ("share", "expected"),
+    # State (episode, t); the episodes have 2, 5 and 1 transitions, and their last states and what lies behind those are never drawn.
+    [
+        (1.0, [(0, 0), (0, 1), (1, 0), (1, 1), (1, 2), (1, 3), (1, 4), (2, 0)]),
+        (0.6, [(0, 0), (0, 1), (1, 2), (1, 3), (1, 4), (2, 0)]),  # 1.2, 3 and 0.6 states, rounded up
+        (0.2, [(0, 1), (1, 4), (2, 0)]),
+        (0.0, [(0, 1), (1, 4), (2, 0)]),  # at least one of each
+    ],
+)
+def test_starts_are_the_last_share_of_each_demonstration(share, expected):
+    states = np.full((3, 7, 2), np.nan, np.float32)
+    for episode, length in enumerate((2, 5, 1)):
         states[episode, : length + 1] = [(episode, t) for t in range(length + 1)]
-    table = rollout.start_table(jnp.asarray(states), jnp.array([2, 3, 1]))
-    assert int(table.count) == 6
-    assert table.states[:6].tolist() == [[0, 0], [0, 1], [1, 0], [1, 1], [1, 2], [2, 0]]
+    table = rollout.StartTable(states=jnp.asarray(states), lengths=jnp.array([2, 5, 1]))
+    drawn = jax.jit(rollout.sample_starts, static_argnums=2)(jax.random.key(0), table, 4000, share=share)
+    rows, counts = np.unique(np.asarray(drawn), axis=0, return_counts=True)
+    assert rows.tolist() == [list(row) for row in expected]
+    # Uniform over the states, not over the demonstrations; five deviations of a binomial.
+    assert np.abs(counts - 4000 / len(expected)).max() < 5 * np.sqrt(4000 / len(expected))
 
 
 DEMONSTRATIONS = corridor_demonstrations((1.0, 0.7), env=ENV)  # 4 and 5 steps, starts 10 and 11; padding is NaN
@@ -87,7 +99,7 @@ DEMONSTRATIONS = corridor_demonstrations((1.0, 0.7), env=ENV)  # 4 and 5 steps, 
 
 @functools.partial(jax.jit, static_argnames="ratio")
 def starts(key, ratio):
-    table = rollout.start_table(DEMONSTRATIONS.states, DEMONSTRATIONS.lengths)
+    table = rollout.StartTable(states=DEMONSTRATIONS.states, lengths=DEMONSTRATIONS.lengths)
     return rollout.reset(key, ENV, GOALS, 3000, starts=table, demo_reset_ratio=ratio)
 
 

@@ -1,0 +1,108 @@
+"""Probe problems for the agent: batches made by hand, a few hundred updates of small networks, values that are known."""
+
+import functools
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from toy_env import FAST_COMPILATION
+
+from hindrl_jax import agent as agents
+from hindrl_jax.config import AgentConfig
+from hindrl_jax.networks import apply_critics
+from hindrl_jax.types import Transition
+
+# The entropy coefficient starts at e^-9 and aims far below the policy's entropy, so that it only falls: values are those of the plain return.
+CONFIG = AgentConfig(
+    net_arch=(16,),
+    learning_rate=1e-2,
+    num_quantiles=4,
+    top_quantiles_to_drop_per_net=0,
+    target_update_rate=0.1,
+    actor_average_rate=0.2,
+    initial_alpha=1e-4,
+    target_entropy=-50.0,
+    final_target_entropy=None,
+    final_learning_rate=None,
+    bc_weight=0.0,
+    input_encoding="raw",
+)
+NUM_UPDATES = 400
+B = 32
+SCHEDULE = agents.schedule(0.0, 0, CONFIG, action_dim=1)
+
+
+def make_batch(*, action, reward, discount, observation=None, next_observation=None, is_demonstration=False):
+    """A batch of B rows of two-dimensional observations; scalars are repeated."""
+
+    def rows(values, width=None):
+        values = jnp.asarray(values, jnp.float32)
+        shape = (B,) if width is None else (B, width)
+        return jnp.broadcast_to(values.reshape((1,) * (len(shape) - values.ndim) + values.shape), shape)
+
+    return Transition(
+        observation=rows([0.0, 0.0] if observation is None else observation, 2),
+        action=rows(action, 1),
+        reward=rows(reward),
+        discount=rows(discount),
+        next_observation=rows([0.0, 0.0] if next_observation is None else next_observation, 2),
+        desired_goal=jnp.zeros((B, 1)),
+        is_demonstration=jnp.broadcast_to(jnp.asarray(is_demonstration), (B,)),
+        is_relabelled=jnp.zeros(B, bool),
+    )
+
+
+UNIT_SCALE = agents.InputScale(observation=jnp.ones(2), goal=jnp.ones(1), observation_centre=jnp.zeros(2), goal_centre=jnp.zeros(1))
+
+
+def inputs_of(observation, config):
+    zeros = jnp.zeros((observation.shape[0], 1))
+    return agents.network_inputs(observation, zeros, zeros, UNIT_SCALE, config)
+
+
+@functools.partial(jax.jit, static_argnames="config", compiler_options=FAST_COMPILATION)
+def fresh_agent(key, config=CONFIG):
+    return agents.init(key, config, observation_dim=2, goal_dim=1, action_dim=1)
+
+
+@functools.partial(jax.jit, static_argnames="config", compiler_options=FAST_COMPILATION)
+def updates(key, start, batch, config):
+    given = dict(
+        inputs=inputs_of(batch.observation, config),
+        next_inputs=inputs_of(batch.next_observation, config),
+        schedule=agents.schedule(0.0, 0, config, action_dim=1),
+    )
+
+    def step(state, key):
+        state, metrics = agents.update(key, state, batch, **given, config=config)
+        return state, (state, metrics)
+
+    return jax.lax.scan(step, start, jax.random.split(key, NUM_UPDATES))[1]
+
+
+def train(seed, batch, config=CONFIG, start=None):
+    """NUM_UPDATES updates on the same batch: the agent after each of them, and their metrics. All of it must be finite."""
+    start = fresh_agent(jax.random.key(seed), config) if start is None else start
+    states, metrics = updates(jax.random.key(1000 + seed), start, batch, config)
+    chex.assert_tree_all_finite((states, metrics))
+    return states, metrics
+
+
+def last(states):
+    return jax.tree.map(lambda leaf: leaf[-1], states)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def values(state, observation, action, config=CONFIG):
+    """Mean over critics and quantiles: (rows,)."""
+    return jnp.mean(apply_critics(state.critics, inputs_of(observation, config).T, action.T, config), axis=(0, 1))
+
+
+@jax.jit
+def mean_action(state, observation):
+    inputs = inputs_of(observation, CONFIG)
+    return agents.select_action(jax.random.key(0), state.actor, inputs, CONFIG, action_dim=1, stochastic=False)
+
+
+ACTIONS = np.linspace(-1.0, 1.0, B, dtype=np.float32)[:, None]

@@ -1,0 +1,216 @@
+"""The agent's other algorithms and levers, on probe problems with known values."""
+
+import dataclasses
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probe import ACTIONS, CONFIG, SCHEDULE, B, fresh_agent, inputs_of, last, make_batch, mean_action, train, values
+
+from hindrl_jax import agent as agents
+from hindrl_jax.config import AgentConfig
+
+BASES = {
+    "sac": dataclasses.replace(CONFIG, base="sac"),
+    "td3": dataclasses.replace(CONFIG, base="td3", actor_delay=2),
+    "ddpg": dataclasses.replace(CONFIG, base="ddpg", num_critics=1),
+}
+
+
+def with_constant_critics(state, constants, *, target=True):
+    """The state with (target) critics that say a constant each, whatever they see: constants (N,) or (N, Q)."""
+    name = "target_critics" if target else "critics"
+    critics = getattr(state, name)["params"]
+    last_layer = critics["Dense_1"]
+    bias = jnp.broadcast_to(jnp.asarray(constants, jnp.float32).reshape(last_layer["bias"].shape[0], -1), last_layer["bias"].shape)
+    last_layer = {"kernel": jnp.zeros_like(last_layer["kernel"]), "bias": bias}
+    return state.replace(**{name: {"params": {**critics, "Dense_1": last_layer}}})
+
+
+def with_constant_action(actor, action):
+    """An actor whose mode is `action` everywhere, with a deviation of e^-5."""
+    last_layer = actor["params"]["Dense_1"]
+    last_layer = {"kernel": jnp.zeros_like(last_layer["kernel"]), "bias": jnp.array([np.arctanh(action), -5.0], jnp.float32)}
+    return {"params": {**actor["params"], "Dense_1": last_layer}}
+
+
+def one_update(state, batch, config, key=0):
+    inputs, next_inputs = inputs_of(batch.observation, config), inputs_of(batch.next_observation, config)
+    schedule = agents.schedule(0.0, 0, config, action_dim=1)
+    step = jax.jit(lambda key: agents.update(key, state, batch, inputs=inputs, next_inputs=next_inputs, schedule=schedule, config=config))
+    return step(jax.random.key(key))
+
+
+@pytest.mark.parametrize("base", BASES)
+def test_value_before_the_reward_is_discounted(base):
+    # Rows of state (0, 0) lead to (1, 1) without reward and with discount 0.7; rows of (1, 1) end with reward 1. Values 0.7 and 1.
+    first = np.arange(B) < B // 2
+    batch = make_batch(
+        action=np.tile(ACTIONS[: B // 2] * 2 + 1, (2, 1)),
+        reward=np.where(first, 0.0, 1.0),
+        discount=np.where(first, 0.7, 0.0),
+        observation=np.where(first[:, None], 0.0, 1.0) * np.ones(2),
+        next_observation=np.ones(2),
+    )
+    states, _ = train(1, batch, BASES[base])
+    found = values(last(states), batch.observation, batch.action, BASES[base])
+    np.testing.assert_allclose(found, np.where(first, 0.7, 1.0), atol=0.08)
+
+
+@pytest.mark.parametrize("base", BASES)
+def test_policy_picks_the_rewarded_action(base):
+    batch = make_batch(action=ACTIONS, reward=1.0 - (ACTIONS[:, 0] - 0.5) ** 2, discount=0.0)
+    states, metrics = train(3, batch, BASES[base])
+    np.testing.assert_allclose(mean_action(last(states), batch.observation), 0.5, atol=0.2)
+    assert ("alpha/value" in metrics) == (base == "sac")
+
+
+@pytest.mark.parametrize(("base", "constants", "expected"), [("sac", (3.0, 1.0), 1.5), ("td3", (3.0, 1.0), 1.5), ("ddpg", (3.0,), 2.5)])
+def test_targets_without_quantiles_by_hand(base, constants, expected):
+    # 1 + 0.5 * (the least critic), but for alpha = e^-30 times the entropy.
+    start = fresh_agent(jax.random.key(0), BASES[base]).replace(log_alpha=jnp.asarray(-30.0))
+    metrics = one_update(with_constant_critics(start, constants), make_batch(action=ACTIONS, reward=1.0, discount=0.5), BASES[base])[1]
+    np.testing.assert_allclose(metrics["critic/target"], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(("base", "constants", "value"), [("sac", (3.0, 1.0), 1.0), ("td3", (3.0, 1.0), 3.0), ("ddpg", (3.0,), 3.0)])
+def test_the_value_that_the_actor_climbs(base, constants, value):
+    # The least critic's or the first one's. One step of Adam moves a constant by the learning rate, 0.01.
+    start = with_constant_critics(fresh_agent(jax.random.key(0), BASES[base]), constants, target=False)
+    metrics = one_update(start, make_batch(action=ACTIONS, reward=0.0, discount=0.0), BASES[base])[1]
+    np.testing.assert_allclose(metrics["actor/value"], value, atol=0.15)
+
+
+@pytest.mark.parametrize(
+    ("base", "noise", "expected"),
+    # The target critic says the action. The target actor plays 0.5, the actor -0.5, which must not be heard.
+    [("ddpg", 0.2, [0.5, 0.5]), ("td3", 0.0, [0.5, 0.5]), ("td3", 1e6, [0.2, 0.8]), ("td3", 0.01, [0.46, 0.54])],
+)
+def test_targets_assume_the_target_actors_action_with_clipped_noise(base, noise, expected):
+    config = dataclasses.replace(BASES[base], target_noise=noise, target_noise_clip=0.3)
+    start = fresh_agent(jax.random.key(0), config)
+    start = start.replace(actor=with_constant_action(start.actor, -0.5), target_actor=with_constant_action(start.target_actor, 0.5))
+    columns = agents._Columns(
+        inputs=jnp.zeros((3, B)),
+        next_inputs=jnp.zeros((3, B)),
+        action=jnp.zeros((1, B)),
+        reward=jnp.zeros(B),
+        discount=jnp.ones(B),
+        is_demonstration=jnp.zeros(B, bool),
+        obtained_return=None,
+        noise=jnp.zeros((1, B)),
+        next_noise=jax.random.normal(jax.random.key(1), (1, B)),
+    )
+    action, bonus = agents._next_action(start, config, columns)
+    assert np.all(np.asarray(bonus) == 0.0)
+    lowest, highest = expected
+    if noise in (0.0, 1e6) or base == "ddpg":
+        np.testing.assert_allclose([action.min(), action.max()], expected, atol=1e-5)
+    else:  # 32 draws with deviation 0.01
+        assert lowest < action.min() < 0.495
+        assert 0.505 < action.max() < highest
+
+
+@pytest.mark.parametrize("base", ["td3", "ddpg"])
+def test_deterministic_policies_explore_with_noise_and_are_followed_by_a_target(base):
+    config = dataclasses.replace(BASES[base], actor_delay=1, exploration_noise=0.2)
+    start = fresh_agent(jax.random.key(0), config)
+    chex.assert_trees_all_equal(start.target_actor, start.actor)
+    after = one_update(start, make_batch(action=ACTIONS, reward=ACTIONS[:, 0], discount=0.0), config)[0]
+    moved = jax.tree.map(lambda old, new: 0.9 * old + 0.1 * new, start.target_actor, after.actor)
+    chex.assert_trees_all_close(after.target_actor, moved, rtol=1e-5, atol=1e-7)
+    actor = with_constant_action(start.actor, 0.5)
+    mode, sampled = (
+        np.asarray(agents.select_action(jax.random.key(0), actor, jnp.zeros((2000, 3)), config, action_dim=1, stochastic=stochastic))
+        for stochastic in (False, True)
+    )
+    np.testing.assert_allclose(mode, 0.5, atol=1e-6)
+    # A deviation of 0.2, of 2000 draws: to 2% or so, clipped at 1 (2.5 deviations away, where 0.6% are).
+    assert sampled.std() == pytest.approx(0.2, rel=0.08)
+    assert sampled.max() == 1.0
+
+
+def test_a_random_subset_of_the_target_critics_is_asked():
+    config = dataclasses.replace(CONFIG, num_critics=4, num_target_critics=2)
+    start = with_constant_critics(fresh_agent(jax.random.key(0), config), [0.0, 1.0, 2.0, 4.0])
+    batch = make_batch(action=ACTIONS, reward=0.0, discount=1.0)
+    inputs = inputs_of(batch.observation, config)
+    update = jax.jit(lambda key: agents.update(key, start, batch, inputs=inputs, next_inputs=inputs, schedule=SCHEDULE, config=config))
+    targets = [round(float(update(jax.random.key(key))[1]["critic/target"]), 2) for key in range(40)]
+    # Means of the six pairs: 0.5, 1, 2, 1.5, 2.5 and 3; alpha is 1e-4. All six are missed together by 40 draws with probability 6 (5/6)^40 = 0.4%.
+    assert set(targets) == {0.5, 1.0, 1.5, 2.0, 2.5, 3.0}
+
+
+def test_a_delayed_actor_moves_at_every_third_step_with_all_that_depends_on_it():
+    config = dataclasses.replace(CONFIG, actor_delay=3)
+    states, _ = train(0, make_batch(action=ACTIONS, reward=ACTIONS[:, 0], discount=0.0, observation=[1.0, 1.0]), config)
+    for name, moves in (("actor", [2, 5]), ("average_actor", [2, 5]), ("critics", range(1, 7)), ("target_critics", range(1, 7))):
+        kernel = np.asarray(getattr(states, name)["params"]["Dense_0"]["kernel"][:7])
+        steps = [step for step in range(1, 7) if np.any(kernel[step] != kernel[step - 1])]
+        assert steps == list(moves), name  # counted from 0
+    assert np.flatnonzero(np.diff(np.asarray(states.log_alpha)[:7])).tolist() == [1, 4]
+    assert states.actor_optimiser.count[:7].tolist() == [0, 0, 1, 1, 1, 2, 2]
+
+
+def test_long_gradients_are_shortened():
+    batch = make_batch(action=ACTIONS, reward=ACTIONS[:, 0] * 10.0, discount=0.0)
+    norms = {}
+    for limit in (None, 0.01, 1e6):
+        config = dataclasses.replace(CONFIG, max_gradient_norm=limit)
+        after = one_update(fresh_agent(jax.random.key(0)), batch, config)[0]
+        # Adam's first moment is a tenth of its first gradient.
+        norms[limit] = [
+            10.0 * float(jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(optimiser.mu))))
+            for optimiser in (after.critic_optimiser, after.actor_optimiser)
+        ]
+    assert min(norms[None]) > 0.012
+    np.testing.assert_allclose(norms[1e6], norms[None], rtol=1e-5)
+    np.testing.assert_allclose(norms[0.01], [0.01, 0.01], rtol=1e-4)
+
+
+def test_normalised_value_is_one_whatever_the_rewards_are():
+    start = with_constant_critics(fresh_agent(jax.random.key(0)), [-40.0, -60.0], target=False)
+    batch = make_batch(action=ACTIONS, reward=0.0, discount=0.0)
+    plain, normalised = (one_update(start, batch, dataclasses.replace(CONFIG, normalise_value=flag))[1] for flag in (False, True))
+    np.testing.assert_allclose(plain["actor/loss"], 50.0, atol=0.3)
+    np.testing.assert_allclose(normalised["actor/loss"], 1.0, atol=1e-3)  # minus -50 / |-50|
+    np.testing.assert_allclose(normalised["actor/value"], plain["actor/value"], rtol=1e-5)
+
+
+def test_the_filter_clones_only_what_is_better_than_the_policys_own_action():
+    # The value is 1 - |action|. Demonstrations play 0.9 in (0, 0), which is bad, and 0 in (1, 1), which is best.
+    kind = np.arange(B) % 4
+    other = np.linspace(-1, 1, B)
+    action = np.choose(kind, [0.9 + 0 * other, 0 * other, other, other])[:, None]
+    batch = make_batch(
+        action=action, reward=1.0 - np.abs(action[:, 0]), discount=0.0, observation=(kind % 2)[:, None] * np.ones(2), is_demonstration=kind < 2
+    )
+    found = {}
+    for q_filter in (False, True):
+        states, metrics = train(4, batch, dataclasses.replace(CONFIG, bc_weight=100.0, q_filter=q_filter))
+        found[q_filter] = mean_action(last(states), jnp.array([[0.0, 0.0], [1.0, 1.0]]))[:, 0]
+        assert metrics["actor/bc_loss"].shape == (400,)
+    np.testing.assert_allclose(found[False], [0.9, 0.0], atol=0.15)
+    np.testing.assert_allclose(found[True], [0.0, 0.0], atol=0.3)
+
+
+def test_weight_of_cloning_moves_linearly_or_not_at_all():
+    config = AgentConfig(bc_weight=0.4, final_bc_weight=0.0)
+    assert [agents.schedule(progress, 0, config, action_dim=1).bc_weight for progress in (0.0, 0.25, 1.0)] == pytest.approx([0.4, 0.3, 0.0])
+    assert agents.schedule(0.5, 0, AgentConfig(bc_weight=0.4), action_dim=1).bc_weight == 0.4
+    # And it is what the loss is told: demonstrations at a distance d add weight * d^2.
+    batch = make_batch(action=ACTIONS, reward=0.0, discount=0.0, is_demonstration=True)
+    start, inputs = fresh_agent(jax.random.key(0)), inputs_of(batch.observation, CONFIG)
+    losses = []
+    for weight in (0.0, 2.0):
+        schedule = SCHEDULE.replace(bc_weight=weight)
+        metrics = agents.update(jax.random.key(0), start, batch, inputs=inputs, next_inputs=inputs, schedule=schedule, config=CONFIG)[1]
+        losses.append(float(metrics["actor/loss"]))
+    np.testing.assert_allclose(losses[1] - losses[0], 2.0 * metrics["actor/bc_loss"], rtol=1e-3)
+
+
+def test_ddpg_has_one_critic():
+    with pytest.raises(ValueError, match="num_critics = 2: set it to 1"):
+        AgentConfig(base="ddpg")
