@@ -22,13 +22,14 @@ _RUN_ONCE = {"xla_backend_optimization_level": 0}  # for a program whose compila
 
 
 class Loop:
-    """Training on FixedGridPickAndPlace with one demonstration."""
+    """Training on FixedGridPickAndPlace."""
 
-    def __init__(self, config: TrainConfig, *, num_seeds: int = 1, num_devices: int = 1, full: bool = False):
+    def __init__(self, config: TrainConfig, *, num_demonstrations: int = 1, num_seeds: int = 1, num_devices: int = 1, full: bool = False):
         """Steps the environments at random: as long as `hindrl_jax.fit` does before it learns, or until the replay is full.
 
         Args:
           config: of the run.
+          num_demonstrations: the same for all seeds.
           num_seeds, num_devices: seeds side by side and how many devices share them, as in `fit`.
           full: fill the replay.
         """
@@ -36,7 +37,7 @@ class Loop:
         self.num_seeds = num_seeds
         self._mesh = Mesh(np.asarray(jax.devices()[:num_devices]), ("seed",))
         self.env = hindrl_jax.make("FixedGridPickAndPlace")
-        demonstrations = hindrl_jax.record_demonstrations(self.env, 1)
+        demonstrations = hindrl_jax.record_demonstrations(self.env, num_demonstrations)
         demonstrations = jax.tree.map(lambda leaf: np.stack([leaf] * num_seeds), jax.device_get(demonstrations))
         demonstrations, seeds = spread((demonstrations, np.arange(num_seeds, dtype=np.uint32)), self._mesh)
         key = jax.jit(over_seeds(jax.random.key, self._mesh))(seeds)
@@ -66,6 +67,12 @@ class Loop:
 
     def _program(self, function: Callable[..., Any], **static: Any) -> Callable[..., Any]:
         return over_seeds(functools.partial(function, env=self.env, config=self.config, **static), self._mesh)
+
+
+def whole_episodes(size: int, num_envs: int) -> int:
+    """The nearest buffer size that is whole episodes of every environment, and two of each at least."""
+    horizon = hindrl_jax.make("FixedGridPickAndPlace").horizon
+    return max(2, round(size / (num_envs * horizon))) * num_envs * horizon
 
 
 def first_seed(tree: Any) -> Any:

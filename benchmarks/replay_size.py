@@ -10,7 +10,7 @@ import numpy as np
 
 import hindrl_jax
 from benchmarks import report, timing
-from benchmarks.loop import Loop, sampler
+from benchmarks.loop import Loop, sampler, whole_episodes
 from benchmarks.timing import Options, Row
 from hindrl_jax.types import Environment
 
@@ -28,7 +28,7 @@ def run(options: Options) -> list[Row]:
     config = hindrl_jax.preset("hindrl")
     loops = {}
     for size in QUICK_SIZES if options.quick else SIZES:
-        loop = Loop(dataclasses.replace(config, buffer_size=_feasible(size, config.num_envs)), full=True)
+        loop = Loop(dataclasses.replace(config, buffer_size=whole_episodes(size, config.num_envs)), full=True)
         loops[loop.capacity] = loop
     effort = dataclasses.replace(options.effort, rounds=ROUNDS * options.effort.rounds)
     sampling = {capacity: timing.calls(sampler(loop, config.batch, BATCHES_PER_CALL), units=BATCHES_PER_CALL) for capacity, loop in loops.items()}
@@ -50,12 +50,6 @@ def run(options: Options) -> list[Row]:
     }
     print(f"  {row['bytes_per_transition']} bytes per transition; conventionally {row['conventional_bytes_per_transition']}", flush=True)
     return [*rows, row]
-
-
-def _feasible(size: int, num_envs: int) -> int:
-    """The nearest buffer size that is whole episodes of every environment, and two of each at least."""
-    horizon = hindrl_jax.make("FixedGridPickAndPlace").horizon
-    return max(2, round(size / (num_envs * horizon))) * num_envs * horizon
 
 
 def _can_be_sampled(loop: Loop) -> int:
