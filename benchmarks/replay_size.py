@@ -74,6 +74,7 @@ def _ratio(rows: list[Row], what: str, clock: str) -> float:
 
 def tables(rows: list[Row]) -> str:
     """Costs by size, their ratio, and the memory."""
+    config = hindrl_jax.preset("hindrl")
     names = {"learn": "one gradient step, whole loop", "sample_batch": "drawing one batch alone"}
     lines = [
         [
@@ -87,8 +88,8 @@ def tables(rows: list[Row]) -> str:
         if row["what"] in names
     ]
     text = (
-        "The default recipe (batch 256, 64 environments) with a full replay. Two episodes per environment are the least that a replay can hold; one "
-        "of them is being written. So the small replay is the smallest there is.\n\n"
+        f"The default recipe (batch {config.batch.batch_size}, {config.num_envs} environments) with a full replay. Two episodes per environment are "
+        "the least that a replay can hold; one of them is being written. So the small replay is the smallest there is.\n\n"
     )
     text += report.table(["what", "room for transitions", "of which can be sampled", "CPU ms", "wall ms"], lines)
     for what, name in names.items():

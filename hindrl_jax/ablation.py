@@ -33,7 +33,7 @@ from hindrl_jax.statistics import Interval, bootstrap
 from hindrl_jax.types import Episodes, RestorableEnvironment
 
 TABLE, TEXT, PICTURE = "ablation.csv", "ablation.md", "ablation.png"
-Group = Literal["baseline", "hindsight", "goals", "targets", "demonstrations", "critic", "actor", "inputs", "replay", "rollout"]
+Group = Literal["baseline", "algorithm", "hindsight", "goals", "targets", "demonstrations", "critic", "actor", "inputs", "replay", "rollout"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +58,9 @@ def half_of_the_run(config: TrainConfig) -> int:
 BASELINE = Lever("default", "baseline", "the default recipe as it is", ())
 
 LEVERS: tuple[Lever, ...] = (
+    Lever("sac", "algorithm", "SAC in place of TQC", (("agent.base", "sac"),)),
+    Lever("td3", "algorithm", "TD3 in place of TQC, with its delayed actor", (("agent.base", "td3"), ("agent.actor_delay", 2))),
+    Lever("ddpg", "algorithm", "DDPG in place of TQC, as DDPGfD and the HinDRL paper have it", (("agent.base", "ddpg"), ("agent.num_critics", 1))),
     Lever("goals-final", "hindsight", "relabelled with the rollout's last goal (HER)", (("batch.hindrl_sampling_strategy", "final"),)),
     Lever("goals-future", "hindsight", "relabelled with goals later in the rollout (HER)", (("batch.hindrl_sampling_strategy", "future"),)),
     Lever("goals-episode", "hindsight", "relabelled with any goal of the rollout (HER)", (("batch.hindrl_sampling_strategy", "episode"),)),
@@ -66,6 +69,19 @@ LEVERS: tuple[Lever, ...] = (
         "hindsight",
         "relabelled with goals of demonstrations and rollouts, half and half (HinDRL)",
         (("batch.hindrl_sampling_strategy", "joint_union"), ("batch.union_sampling_ratio", 0.5)),
+    ),
+    Lever("goals-random", "hindsight", "relabelled with any goal of any rollout (HER)", (("batch.hindrl_sampling_strategy", "random"),)),
+    Lever(
+        "goals-intersection",
+        "hindsight",
+        "relabelled with goals of the rollout that lie near a demonstrated one (HinDRL)",
+        (("batch.hindrl_sampling_strategy", "joint_intersection"),),
+    ),
+    Lever(
+        "goals-intersection-demo",
+        "hindsight",
+        "relabelled with demonstrated goals that the rollout came near (HinDRL)",
+        (("batch.hindrl_sampling_strategy", "joint_intersection"), ("batch.intersection_goals", "demonstrations")),
     ),
     Lever("no-relabelling", "hindsight", "no relabelled rows (the thesis's TQCfD)", (("algo", "tqcfd"), ("batch.num_sampled_goals", 0.0))),
     Lever("relabelled-4", "hindsight", "four relabelled rows for each original one, in place of 1/4 (thesis)", (("batch.num_sampled_goals", 4.0),)),
@@ -83,6 +99,12 @@ LEVERS: tuple[Lever, ...] = (
         "demonstration goals filtered by epsilon (the thesis's Smooth HinDRL)",
         (("algo", "smooth-hindrl"), ("goal.epsilon_filtering", True)),
     ),
+    Lever(
+        "achieved-goals",
+        "goals",
+        "half of the rollouts, falling to none, aim at states reached earlier; goals of demonstrations and rollouts (thesis, chapter 6)",
+        (("goal.achieved_goal_ratio", 0.5), ("goal.final_achieved_goal_ratio", 0.0), ("batch.hindrl_sampling_strategy", "joint_union")),
+    ),
     Lever("n-step-1", "targets", "1-step returns in place of 5 (thesis)", (("batch.n_step", 1),)),
     Lever("n-step-3", "targets", "3-step returns in place of 5", (("batch.n_step", 3),)),
     Lever("gamma-0.99", "targets", "discount 0.99 in place of 0.98 (thesis)", (("batch.gamma", 0.99),)),
@@ -99,6 +121,7 @@ LEVERS: tuple[Lever, ...] = (
         "episodes cut by the horizon count as terminated (original code)",
         (("batch.timeouts_are_terminal", True),),
     ),
+    Lever("demo-monte-carlo", "targets", "demonstration rows have their whole return (DDPGfD)", (("batch.demo_returns", "monte_carlo"),)),
     Lever("demo-rows-none", "demonstrations", "no demonstration rows in the batch, so no cloning either", (("batch.max_demo_ratio", 0.0),)),
     Lever("demo-rows-half", "demonstrations", "half of the batch are demonstration rows, not a quarter (RLPD)", (("batch.max_demo_ratio", 0.5),)),
     Lever(
@@ -110,6 +133,16 @@ LEVERS: tuple[Lever, ...] = (
     Lever("bc-0", "demonstrations", "no cloning loss", (("agent.bc_weight", 0.0),)),
     Lever("bc-0.1", "demonstrations", "cloning loss with weight 0.1 in place of 0.01", (("agent.bc_weight", 0.1),)),
     Lever("bc-1", "demonstrations", "cloning loss with weight 1 in place of 0.01 (thesis)", (("agent.bc_weight", 1.0),)),
+    Lever("bc-fades", "demonstrations", "the weight of the cloning loss falls to 0 along the run", (("agent.final_bc_weight", 0.0),)),
+    Lever(
+        "q-filter",
+        "demonstrations",
+        "cloning loss with weight 0.1 where the critics prefer the demonstrated action (Nair et al.)",
+        (("agent.q_filter", True), ("agent.bc_weight", 0.1)),
+    ),
+    Lever("value-normalised", "demonstrations", "value in the actor's loss over its mean size (TD3+BC)", (("agent.normalise_value", True),)),
+    Lever("bc-warm-start", "demonstrations", "500 gradient steps of cloning before the first of reinforcement learning", (("bc_warm_start", 500),)),
+    Lever("pretraining", "demonstrations", "500 gradient steps on demonstrations alone at first (DQfD, DDPGfD)", (("pretrain_updates", 500),)),
     Lever("bc-norm", "demonstrations", "cloning loss is the distance, not its square (original code)", (("agent.bc_loss", "norm"),)),
     Lever("bc-sample", "demonstrations", "cloning loss of a sampled action, not of the mean one (original code)", (("agent.bc_action", "sample"),)),
     Lever(
@@ -119,18 +152,40 @@ LEVERS: tuple[Lever, ...] = (
         (("demo_reset_ratio", 0.25),),
     ),
     Lever("demo-resets-0.5", "demonstrations", "half of all episodes begin in demonstrated states (Nair et al.)", (("demo_reset_ratio", 0.5),)),
+    Lever(
+        "demo-resets-reverse",
+        "demonstrations",
+        "half of all episodes begin in demonstrated states, the last ones first (RFCL)",
+        (("demo_reset_ratio", 0.5), ("demo_reset_curriculum", 0.5)),
+    ),
     Lever("layer-norm", "critic", "layer normalisation in the critics (RLPD)", (("agent.layer_norm", True),)),
     Lever("critics-1", "critic", "1 critic in place of 2", (("agent.num_critics", 1),)),
     Lever("critics-5", "critic", "5 critics in place of 2 (TQC)", (("agent.num_critics", 5),)),
+    Lever("redq", "critic", "5 critics, of which 2 at random make the targets (REDQ)", (("agent.num_critics", 5), ("agent.num_target_critics", 2))),
     Lever("no-truncation", "critic", "no quantiles dropped from the targets", (("agent.top_quantiles_to_drop_per_net", 0),)),
     Lever("target-rate-0.005", "critic", "target critics follow at 0.005 in place of 0.02 (TQC)", (("agent.target_update_rate", 0.005),)),
+    Lever("gradients-clipped", "critic", "gradients of actor and critics no longer than 1", (("agent.max_gradient_norm", 1.0),)),
+    Lever("actor-delayed", "actor", "one gradient step of the actor for two of the critics (TD3)", (("agent.actor_delay", 2),)),
     Lever("alpha-1", "actor", "the entropy coefficient starts at 1 in place of 0.002 (SAC)", (("agent.initial_alpha", 1.0),)),
     Lever("entropy-constant", "actor", "the target entropy stays at -1, it does not fall to -10", (("agent.final_target_entropy", None),)),
-    Lever("no-actor-average", "actor", "the actor is evaluated as it is, not its running average", (("agent.actor_average_rate", 1.0),)),
-    Lever("actor-average-span", "actor", "the actor's average spans at least a quarter of the run so far", (("agent.actor_average_span", 0.25),)),
+    Lever(
+        "no-actor-average",
+        "actor",
+        "the actor is evaluated as it is, not its running average",
+        (("agent.actor_average_rate", 1.0), ("agent.actor_average_span", 0.0)),
+    ),
+    Lever(
+        "actor-average-short", "actor", "the actor's average spans about 500 gradient steps, all along the run", (("agent.actor_average_span", 0.0),)
+    ),
     Lever("inputs-raw", "inputs", "networks see inputs as they are (thesis)", (("agent.input_encoding", "raw"),)),
     Lever("inputs-standardised", "inputs", "networks see standardised inputs", (("agent.input_encoding", "standardised"),)),
     Lever("batch-1024", "replay", "batches of 1,024 rows in place of 256", (("batch.batch_size", 1_024),)),
+    Lever(
+        "environments-64",
+        "rollout",
+        "64 environments side by side, whose steps are four times as many for each gradient step",
+        (("num_envs", 64), ("learning_starts", 6_400)),
+    ),
     Lever("updates-8", "rollout", "8 gradient steps per vectorised environment step in place of 2", (("updates_per_iteration", 8),)),
 )
 

@@ -175,7 +175,7 @@ class AgentConfig:
     """Share of the online critics that moves into the target critics at each gradient step (Polyak averaging)."""
     actor_average_rate: float = 0.002
     """Share of the actor that moves into its running average at each gradient step; evaluations and the saved policy use the average."""
-    actor_average_span: float = 0.0
+    actor_average_span: float = 0.25
     """Share of the gradient steps so far that the average spans at least: it moves by at most 1 / (1 + span * steps), less and less."""
     initial_alpha: float = 0.002
     """Entropy coefficient at the start; it is tuned automatically from there."""
@@ -261,13 +261,13 @@ class TrainConfig:
 
     algo: Algorithm = "hindrl"
     """Which of the four models: bc, tqcfd (no relabelling), hindrl, smooth-hindrl."""
-    steps: int = 300_000
+    steps: int = 160_000
     """Environment steps of the run per seed, rounded up to a tenth of eval_every; for bc, which takes none, gradient steps."""
-    num_envs: int = 64
+    num_envs: int = 16
     """Environments stepped side by side."""
     updates_per_iteration: int = 2
     """Gradient steps after each (vectorised) environment step."""
-    learning_starts: int = 6_400
+    learning_starts: int = 1_600
     """Environment steps with uniformly random actions before the first gradient step; at least one horizon in each environment is taken."""
     demo_reset_ratio: float = 0.0
     """Share of training episodes that begin in a demonstrated state, drawn uniformly, with the steps that it had left (Nair et al., overcoming
@@ -282,7 +282,7 @@ class TrainConfig:
     al., 2018; DDPGfD, Vecerik et al., 2017)."""
     buffer_size: int = 500_000
     """Transitions that the replay holds."""
-    eval_every: int = 16_000
+    eval_every: int = 4_000
     """Environment steps (bc: gradient steps) between evaluations."""
     eval_episodes: int = 100
     """Episodes of each evaluation, with the policy's mean action."""

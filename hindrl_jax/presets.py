@@ -60,7 +60,7 @@ def _default(algo: Algorithm, family: Family) -> TrainConfig:
             steps=4_000,
             eval_every=1_000,
             batch=BatchConfig(n_step=1),
-            agent=AgentConfig(net_arch=(64, 64), input_encoding=encoding),
+            agent=AgentConfig(net_arch=(64, 64), actor_average_span=0.0, input_encoding=encoding),
         )
     if family == "grid":
         return TrainConfig()
@@ -88,7 +88,7 @@ def _default(algo: Algorithm, family: Family) -> TrainConfig:
     )
 
 
-_FRAMEWORK = dict(input_encoding="raw", actor_average_rate=1.0, policy_input="achieved_desired_observation")
+_FRAMEWORK = dict(input_encoding="raw", actor_average_rate=1.0, actor_average_span=0.0, policy_input="achieved_desired_observation")
 """How the networks of the thesis's framework are fed and evaluated."""
 
 
