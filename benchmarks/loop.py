@@ -7,14 +7,16 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
 import hindrl_jax
-from hindrl_jax import replay
+from hindrl_jax import priorities, replay
 from hindrl_jax import train as training
 from hindrl_jax.config import BatchConfig, TrainConfig
 from hindrl_jax.devices import over_seeds, spread
+from hindrl_jax.priorities import Priorities
 from hindrl_jax.train import Guidance, TrainState
 from hindrl_jax.types import Array, Environment, Transition
 
@@ -95,7 +97,7 @@ def draw_batch(key: Array, state: TrainState, data: Guidance, *, env: Environmen
 
 
 def sampler(loop: Loop, config: BatchConfig, num_batches: int) -> Callable[[], Transition]:
-    """Compiles the drawing of `num_batches` batches, one after the other, from the replay that the loop (of one seed) has at each call."""
+    """Compiles the uniform drawing of `num_batches` batches, one after the other, from the replay that the loop (of one seed) has at each call."""
 
     @jax.jit
     def draw(key: Array, state: TrainState, data: Guidance) -> Transition:
@@ -105,3 +107,33 @@ def sampler(loop: Loop, config: BatchConfig, num_batches: int) -> Callable[[], T
 
     key = jax.random.key(0)
     return lambda: jax.block_until_ready(draw(key, loop.state, loop.data))
+
+
+def prioritised_sampler(loop: Loop, num_batches: int) -> Callable[[], None]:
+    """As `sampler`, by the priorities of a loop that has them: as many batches at a time as in its iterations, then new priorities for their rows.
+
+    Each call goes on from the priorities that the last one left. Errors are made up; what it takes to compute them is not in here.
+    """
+    config, together = loop.config.batch, loop.config.updates_per_iteration
+
+    @functools.partial(jax.jit, donate_argnums=0)
+    def draw(first: Priorities, key: Array, state: TrainState, data: Guidance) -> tuple[Priorities, Transition]:
+        state, data = first_seed((state, data))
+        given = dict(demonstrations=data.demonstrations, table=data.goals, achieved_goal=loop.env.achieved_goal, epsilon=data.epsilon, config=config)
+
+        def iteration(before: Priorities, key: Array) -> tuple[Priorities, Transition]:
+            sample = functools.partial(replay.sample_prioritised_batch, replay=state.replay.replace(priorities=before), **given)
+            batches, drawn = jax.vmap(sample)(jax.random.split(key, together))
+            return priorities.assign(before, drawn, batches.weight, config), batches
+
+        return jax.lax.scan(iteration, first, jax.random.split(key, num_batches // together))
+
+    key = jax.random.key(0)
+    latest = jax.tree.map(jnp.copy, first_seed(loop.state.replay.priorities))
+
+    def call() -> None:
+        nonlocal latest
+        latest, batches = draw(latest, key, loop.state, loop.data)
+        jax.block_until_ready((latest, batches))
+
+    return call

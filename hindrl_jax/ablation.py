@@ -179,6 +179,12 @@ LEVERS: tuple[Lever, ...] = (
     ),
     Lever("inputs-raw", "inputs", "networks see inputs as they are (thesis)", (("agent.input_encoding", "raw"),)),
     Lever("inputs-standardised", "inputs", "networks see standardised inputs", (("agent.input_encoding", "standardised"),)),
+    Lever(
+        "prioritised",
+        "replay",
+        "transitions drawn by their errors, demonstrations with a bonus (prioritised replay; DDPGfD)",
+        (("batch.priority_exponent", 0.6), ("batch.demo_priority_bonus", 1.0)),
+    ),
     Lever("batch-1024", "replay", "batches of 1,024 rows in place of 256", (("batch.batch_size", 1_024),)),
     Lever(
         "environments-64",

@@ -198,6 +198,7 @@ class _Columns:
     obtained_return: Array | None  # (B,)
     noise: Array  # (A, B) standard normal, for the sampled action
     next_noise: Array  # (A, B) the same for the next action
+    weight: Array | None = None  # (B,)
 
 
 _BLOCK_BYTES = 2**19
@@ -238,7 +239,7 @@ def update(
     Args:
       key: random key.
       state: the agent.
-      batch: B transitions.
+      batch: B transitions; their weights, if they have any, are those of the critics' losses.
       inputs, next_inputs: (B, input_dim) network inputs at the two ends of the transitions, see `network_inputs`.
       schedule: see `schedule`.
       config: static.
@@ -246,26 +247,8 @@ def update(
     Returns:
       The new agent and scalar metrics.
     """
-    key_actor, key_next, key_critics = jax.random.split(key, 3)
     num_blocks = _num_blocks(batch.action.shape[0], config)
-    # The barrier makes the transposition one copy, not a strided read in every product.
-    inputs, next_inputs, action = jax.lax.optimization_barrier((inputs.T, next_inputs.T, batch.action.T))
-    columns = _Columns(
-        inputs=inputs,
-        next_inputs=next_inputs,
-        action=action,
-        reward=batch.reward,
-        discount=batch.discount,
-        is_demonstration=batch.is_demonstration,
-        obtained_return=batch.obtained_return,
-        noise=jax.random.normal(key_actor, action.shape),
-        next_noise=jax.random.normal(key_next, action.shape),
-    )
-
-    target_critics = state.target_critics
-    if config.num_target_critics is not None:
-        chosen = jax.random.permutation(key_critics, config.num_critics)[: config.num_target_critics]
-        target_critics = jax.tree.map(lambda leaf: leaf[chosen], target_critics)
+    columns, target_critics = _prepare(key, state, batch, inputs, next_inputs, config)
     gradient, critic_metrics = _mean_over_blocks(functools.partial(_critic_gradient, state, target_critics, config), columns, num_blocks)
     critics, critic_optimiser = _descend(gradient, state.critic_optimiser, state.critics, schedule.learning_rate, max_norm=config.max_gradient_norm)
     state = state.replace(
@@ -281,8 +264,45 @@ def update(
     return moved, {**critic_metrics, **actor_metrics, **alpha_metrics, "batch/reward": jnp.sum(batch.reward)}
 
 
-def _critic_gradient(state: AgentState, target_critics: Params, config: AgentConfig, block: _Columns) -> tuple[Params, Metrics]:
-    """The gradient of the critics' loss over a block, and metrics."""
+def td_error(key: Array, state: AgentState, batch: Transition, *, inputs: Array, next_inputs: Array, config: AgentConfig) -> Array:
+    """How far the critics are from their targets: |mean of all critics' atoms - mean of the targets|, for each row of a batch.
+
+    Args: as for `update`.
+
+    Returns:
+      (B,), not weighted.
+    """
+    columns, target_critics = _prepare(key, state, batch, inputs, next_inputs, config)
+    values = mean_return(state.critics, columns.inputs, columns.action, config)
+    return jnp.abs(values - jnp.mean(_targets(state, target_critics, config, columns), axis=0))
+
+
+def _prepare(key: Array, state: AgentState, batch: Transition, inputs: Array, next_inputs: Array, config: AgentConfig) -> tuple[_Columns, Params]:
+    """The batch in columns, with the noise of its actions, and the target critics that are asked."""
+    key_actor, key_next, key_critics = jax.random.split(key, 3)
+    # The barrier makes the transposition one copy, not a strided read in every product.
+    inputs, next_inputs, action = jax.lax.optimization_barrier((inputs.T, next_inputs.T, batch.action.T))
+    columns = _Columns(
+        inputs=inputs,
+        next_inputs=next_inputs,
+        action=action,
+        reward=batch.reward,
+        discount=batch.discount,
+        is_demonstration=batch.is_demonstration,
+        obtained_return=batch.obtained_return,
+        noise=jax.random.normal(key_actor, action.shape),
+        next_noise=jax.random.normal(key_next, action.shape),
+        weight=batch.weight,
+    )
+    target_critics = state.target_critics
+    if config.num_target_critics is not None:
+        chosen = jax.random.permutation(key_critics, config.num_critics)[: config.num_target_critics]
+        target_critics = jax.tree.map(lambda leaf: leaf[chosen], target_critics)
+    return columns, target_critics
+
+
+def _targets(state: AgentState, target_critics: Params, config: AgentConfig, block: _Columns) -> Array:
+    """What the critics of each column are moved towards: (M, B) target atoms, or (1, B) without quantiles."""
     next_action, entropy_bonus = _next_action(state, config, block)
     next_atoms = apply_critics(target_critics, block.next_inputs, next_action, config)  # (N, Q, B)
     bellman = dict(reward=block.reward, discount=block.discount, entropy_bonus=entropy_bonus)
@@ -295,11 +315,17 @@ def _critic_gradient(state: AgentState, target_critics: Params, config: AgentCon
         targets = jnp.clip(targets, 0.0, 1.0)
     if block.obtained_return is not None:
         targets = jnp.maximum(targets, block.obtained_return[None])
+    return targets
+
+
+def _critic_gradient(state: AgentState, target_critics: Params, config: AgentConfig, block: _Columns) -> tuple[Params, Metrics]:
+    """The gradient of the critics' loss over a block, and metrics."""
+    targets = _targets(state, target_critics, config, block)
 
     def loss(critics: Params) -> tuple[Array, Metrics]:
         quantiles = apply_critics(critics, block.inputs, block.action, config)
         errors = quantile_huber(quantiles, targets) if config.base == "tqc" else squared_error(quantiles[:, 0], targets[0])
-        value = jnp.mean(errors)
+        value = jnp.mean(errors if block.weight is None else errors * block.weight[None])
         return value, {"critic/loss": value, "critic/value": jnp.mean(quantiles), "critic/target": jnp.mean(targets)}
 
     return jax.grad(loss, has_aux=True)(state.critics)

@@ -55,6 +55,14 @@ class BatchConfig:
     actions nor rewards are random (He et al., optimality tightening, 2017; Oh et al., self-imitation learning, 2018)."""
     timeouts_are_terminal: bool = False
     """Treat episodes cut by the horizon as terminated, as the original code does by mistake."""
+    priority_exponent: float = 0.0
+    """0 draws transitions uniformly. More draws them in proportion to their temporal-difference error to this power (Schaul et al., prioritised
+    experience replay, 2016), from demonstrations and replay together: max_demo_ratio and reach_zero then have no say."""
+    importance_exponent: float = 0.4
+    """With priorities: 1 corrects the critics' loss wholly for what is drawn too often, 0 not at all. Schaul's first value, kept: his rise to 1
+    makes the end of training unbiased, and sparse rewards are found long before."""
+    demo_priority_bonus: float = 0.0
+    """With priorities: what is added to the error of a demonstration's transitions, so that they keep being drawn (DDPGfD, Vecerik et al., 2017)."""
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -73,7 +81,17 @@ class BatchConfig:
             ),
             n_step=(self.n_step >= 1, "at least 1"),
             gamma=(0.0 < self.gamma <= 1.0, "in (0, 1]"),
+            priority_exponent=(0.0 <= self.priority_exponent <= 1.0, "between 0 (uniform) and 1"),
+            importance_exponent=(0.0 <= self.importance_exponent <= 1.0, "between 0 and 1"),
+            demo_priority_bonus=(self.demo_priority_bonus >= 0.0, "0 or more"),
         )
+        if self.demo_priority_bonus > 0.0 and not self.has_priorities:
+            raise ValueError(f"demo_priority_bonus = {self.demo_priority_bonus} is of no use while priority_exponent = 0: raise that, too")
+        if self.reach_zero is not None and self.has_priorities:
+            raise ValueError(
+                f"reach_zero = {self.reach_zero} is of no use with priority_exponent = {self.priority_exponent}, by which the share of "
+                "demonstrations follows from their priorities: set one of them to None or 0"
+            )
         if (self.hindrl_sampling_strategy == "mixture") != bool(self.strategy_mixture):
             raise ValueError(
                 f"strategy_mixture = {self.strategy_mixture!r} and hindrl_sampling_strategy = {self.hindrl_sampling_strategy!r} do not belong "
@@ -84,6 +102,11 @@ class BatchConfig:
                 f"max_demo_ratio = {self.max_demo_ratio} of batch_size = {self.batch_size} leaves no replay row: "
                 "lower max_demo_ratio or raise batch_size"
             )
+
+    @property
+    def has_priorities(self) -> bool:
+        """Whether transitions are drawn by their priorities rather than uniformly."""
+        return self.priority_exponent > 0.0
 
     @property
     def max_demo_rows(self) -> int:

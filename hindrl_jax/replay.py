@@ -5,6 +5,8 @@ following rows, and relabelled goals, rewards and n-step returns are computed wh
 
 Every environment owns a ring of episode slots, so that writing needs no bookkeeping between environments. One slot per ring is being written;
 only complete episodes are sampled, and an episode is overwritten as a whole.
+
+Transitions are drawn uniformly, by `sample_batch`, or by their priorities, by `sample_prioritised_batch`; both read what they have drawn alike.
 """
 
 from __future__ import annotations
@@ -15,12 +17,14 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from hindrl_jax import priorities as prioritised
 from hindrl_jax.config import BatchConfig, Source
 from hindrl_jax.errors import UserError
 from hindrl_jax.goals import GoalTable, goal_reached, sample_goals
+from hindrl_jax.priorities import Drawn, Priorities
 from hindrl_jax.randomness import uniform_index
 from hindrl_jax.relabel import choose_sources, hindsight_steps, intersection_steps
-from hindrl_jax.types import Array, Episodes, Transition
+from hindrl_jax.types import Array, Episodes, Transition, tree_where
 
 
 @struct.dataclass(kw_only=True)
@@ -33,6 +37,7 @@ class ReplayState:
     num_complete: Array  # (E,) int32, complete episodes in each ring, at most R - 1
     judged_by_goal: Array  # (E * R,) bool, whether an episode is rewarded for reaching its behavioural goal rather than by the environment
     nearby_goals: Array | None  # (E * R, T + 1) int32, for each state but the first a row of the goal table near it, or -1; None if not kept
+    priorities: Priorities | None = None  # of all transitions, those of the demonstrations included; None where they are drawn uniformly
 
 
 def init(
@@ -105,7 +110,8 @@ def add(
     num_envs = replay.slot.shape[0]
     episodes = replay.episodes
     slots = episodes.lengths.shape[0] // num_envs
-    row, step, ended = jnp.arange(num_envs) * slots + replay.slot, replay.step, terminated | truncated
+    first, step, ended = jnp.arange(num_envs) * slots, replay.step, terminated | truncated
+    row, next_slot = first + replay.slot, jnp.where(ended, (replay.slot + 1) % slots, replay.slot)
     episodes = episodes.replace(
         observations=episodes.observations.at[row, step].set(observation).at[row, step + 1].set(next_observation),
         actions=episodes.actions.at[row, step].set(action),
@@ -114,13 +120,17 @@ def add(
         terminated=episodes.terminated.at[row].set(terminated),
         desired_goals=episodes.desired_goals.at[row].set(desired_goal),
     )
+    priorities = replay.priorities
+    if priorities is not None:
+        priorities = prioritised.add(priorities, row, step + 1, first + next_slot)
     return ReplayState(
         episodes=episodes,
-        slot=jnp.where(ended, (replay.slot + 1) % slots, replay.slot),
+        slot=next_slot,
         step=jnp.where(ended, 0, step + 1),
         num_complete=jnp.minimum(replay.num_complete + ended, slots - 1),
         judged_by_goal=replay.judged_by_goal.at[row].set(judged_by_goal),
         nearby_goals=None if replay.nearby_goals is None else replay.nearby_goals.at[row, step + 1].set(nearby_goal),
+        priorities=priorities,
     )
 
 
@@ -259,6 +269,63 @@ def _new_goals(
     return goals, found
 
 
+def _num_relabelled(num_replay_rows: Array, config: BatchConfig) -> Array:
+    """Of the rows that come from the replay n / (n + 1), rounded down."""
+    share = config.num_sampled_goals / (config.num_sampled_goals + 1)
+    return jnp.floor(num_replay_rows * share + 1e-3).astype(jnp.int32)  # the margin is for float32's rounding
+
+
+def _replay_rows(
+    key: Array,
+    replay: ReplayState,
+    rows: Array,
+    steps: Array,
+    relabelled: Array,
+    table: GoalTable,
+    *,
+    achieved_goal: Callable[[Array], Array],
+    epsilon: Array,
+    config: BatchConfig,
+) -> Transition:
+    """Reads rows of the replay, those that are to be `relabelled` (B,) with goals of the config's sources as far as there are any."""
+    desired_goals = replay.episodes.desired_goals[rows]
+    new_goals = desired_goals
+    if config.sources:
+        new_goals, found = _new_goals(key, replay, rows, steps, table, achieved_goal=achieved_goal, config=config)
+        relabelled &= found
+    # A row of an episode that is judged by its behavioural goal is read as if that were a goal chosen in hindsight.
+    return transitions(
+        replay.episodes,
+        rows,
+        steps,
+        achieved_goal=achieved_goal,
+        new_goals=jnp.where(relabelled[:, None], new_goals, desired_goals),
+        relabelled=relabelled | replay.judged_by_goal[rows],
+        epsilon=epsilon,
+        is_demonstration=False,
+        n_step=config.n_step,
+        config=config,
+    )
+
+
+def _demonstration_rows(
+    demonstrations: Episodes, rows: Array, steps: Array, *, achieved_goal: Callable[[Array], Array], epsilon: Array, config: BatchConfig
+) -> Transition:
+    """Reads rows of the demonstrations, which are never relabelled."""
+    return transitions(
+        demonstrations,
+        rows,
+        steps,
+        achieved_goal=achieved_goal,
+        new_goals=demonstrations.desired_goals[rows],
+        relabelled=jnp.zeros(rows.shape, bool),
+        epsilon=epsilon,
+        is_demonstration=True,
+        n_step=demonstrations.rewards.shape[1] if config.demo_returns == "monte_carlo" else config.n_step,
+        config=config,
+    )
+
+
 def sample_batch(
     key: Array,
     replay: ReplayState,
@@ -290,42 +357,48 @@ def sample_batch(
     """
     key_demo, key_demo_step, key_episode, key_step, key_goal = jax.random.split(key, 5)
     size, num_demos = config.batch_size, demonstrations.lengths.shape[0]
-
+    read = dict(achieved_goal=achieved_goal, epsilon=epsilon, config=config)
     rows = sample_episodes(key_episode, replay, size)
     steps = sample_steps(key_step, replay.episodes, rows)
-    relabelled_share = config.num_sampled_goals / (config.num_sampled_goals + 1)
-    relabelled_rows = jnp.floor((size - demo_rows) * relabelled_share + 1e-3).astype(jnp.int32)  # the margin is for float32's rounding
     index = jnp.arange(size)
-    relabelled = (index >= demo_rows) & (index < demo_rows + relabelled_rows)
-    new_goals = replay.episodes.desired_goals[rows]
-    if config.sources:
-        new_goals, found = _new_goals(key_goal, replay, rows, steps, table, achieved_goal=achieved_goal, config=config)
-        relabelled &= found
-    read = dict(achieved_goal=achieved_goal, epsilon=epsilon, config=config)
-    # A row of an episode that is judged by its behavioural goal is read as if that were a goal chosen in hindsight.
-    new_goals = jnp.where(relabelled[:, None], new_goals, replay.episodes.desired_goals[rows])
-    relabelled |= replay.judged_by_goal[rows]
-    batch = transitions(
-        replay.episodes, rows, steps, new_goals=new_goals, relabelled=relabelled, is_demonstration=False, n_step=config.n_step, **read
-    )
+    relabelled = (index >= demo_rows) & (index < demo_rows + _num_relabelled(size - demo_rows, config))
+    batch = _replay_rows(key_goal, replay, rows, steps, relabelled, table, **read)
     if config.max_demo_rows == 0:
         return batch
 
     demo = uniform_index(key_demo, (config.max_demo_rows,), num_demos)
-    demo_batch = transitions(
-        demonstrations,
-        demo,
-        sample_steps(key_demo_step, demonstrations, demo),
-        new_goals=demonstrations.desired_goals[demo],
-        relabelled=jnp.zeros(demo.shape, bool),
-        is_demonstration=True,
-        n_step=demonstrations.rewards.shape[1] if config.demo_returns == "monte_carlo" else config.n_step,
-        **read,
-    )
-    use_demo = index[: config.max_demo_rows] < demo_rows
+    demo_batch = _demonstration_rows(demonstrations, demo, sample_steps(key_demo_step, demonstrations, demo), **read)
+    head = jax.tree.map(lambda leaf: leaf[: config.max_demo_rows], batch)
+    head = tree_where(index[: config.max_demo_rows] < demo_rows, demo_batch, head)
+    return jax.tree.map(lambda leaf, first: leaf.at[: config.max_demo_rows].set(first), batch, head)
 
-    def merge(demo_leaf: Array, leaf: Array) -> Array:
-        head = leaf[: config.max_demo_rows]
-        return leaf.at[: config.max_demo_rows].set(jnp.where(use_demo.reshape((-1,) + (1,) * (leaf.ndim - 1)), demo_leaf, head))
 
-    return jax.tree.map(merge, demo_batch, batch)
+def sample_prioritised_batch(
+    key: Array,
+    replay: ReplayState,
+    demonstrations: Episodes,
+    table: GoalTable,
+    *,
+    achieved_goal: Callable[[Array], Array],
+    epsilon: Array,
+    config: BatchConfig,
+) -> tuple[Transition, Drawn]:
+    """Draws the batch of one gradient step by the priorities of the transitions, see `priorities`.
+
+    Of the rows that happen to come from the replay, n / (n + 1) (rounded down) are relabelled, or fewer where intersections are empty.
+
+    Args: as for `sample_batch`, the replay with its priorities.
+
+    Returns:
+      A batch of `config.batch_size` rows in no particular order, with weights, and where its rows come from.
+    """
+    key_draw, key_goal = jax.random.split(key)
+    read = dict(achieved_goal=achieved_goal, epsilon=epsilon, config=config)
+    drawn = prioritised.draw(key_draw, replay.priorities, config.batch_size)
+    # How many rows come from where is not known when this is compiled, so each is read from both tables, and one reading thrown away.
+    replayed = ~drawn.is_demonstration
+    relabelled = replayed & (jnp.cumsum(replayed) <= _num_relabelled(jnp.sum(replayed), config))  # the first of them: all are drawn alike
+    from_replay = _replay_rows(key_goal, replay, drawn.rows, drawn.steps, relabelled, table, **read)
+    from_demonstrations = _demonstration_rows(demonstrations, drawn.rows, drawn.steps, **read)
+    batch = tree_where(replayed, from_replay, from_demonstrations)
+    return batch.replace(weight=prioritised.importance_weights(drawn, config)), drawn

@@ -14,11 +14,12 @@ import jax.numpy as jnp
 from flax import struct
 
 from hindrl_jax import agent as agents
-from hindrl_jax import goals, replay, rollout
+from hindrl_jax import goals, priorities, replay, rollout
 from hindrl_jax.agent import AgentState, InputScale, Metrics
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.errors import UserError
 from hindrl_jax.goals import GoalTable
+from hindrl_jax.priorities import Drawn
 from hindrl_jax.randomness import uniform_index
 from hindrl_jax.relabel import hindsight_steps
 from hindrl_jax.replay import ReplayState
@@ -106,15 +107,18 @@ def init(key: Array, data: Guidance, env: Environment, config: TrainConfig) -> T
     key_agent, key_rollout, key_train = jax.random.split(key, 3)
     dims = dict(observation_dim=env.observation_dim, goal_dim=env.goal_dim, action_dim=env.action_dim)
     smallest = 2 * config.num_envs * env.horizon
+    empty = replay.init(
+        num_envs=config.num_envs,
+        capacity=smallest if config.algo == "bc" else config.buffer_size,
+        horizon=env.horizon,
+        keep_nearby_goals=_uses_intersections(config),
+        **dims,
+    )
+    if config.batch.has_priorities:
+        empty = empty.replace(priorities=priorities.init(data.demonstrations, empty.episodes, config.batch))
     return TrainState(
         agent=agents.init(key_agent, config.agent, **dims),
-        replay=replay.init(
-            num_envs=config.num_envs,
-            capacity=smallest if config.algo == "bc" else config.buffer_size,
-            horizon=env.horizon,
-            keep_nearby_goals=_uses_intersections(config),
-            **dims,
-        ),
+        replay=empty,
         rollout=_new_episodes(key_rollout, data, env, config, 0.0),
         key=key_train,
         env_steps=jnp.asarray(0),
@@ -225,16 +229,21 @@ def learn(state: TrainState, data: Guidance, *, env: Environment, config: TrainC
         key, key_interact, key_batch, key_updates = jax.random.split(state.key, 4)
         act = make_policy(state.agent.actor, data.scale, env, config, stochastic=True)
         state = _interact(key_interact, state.replace(key=key), data, env, config, act)
-        draw = functools.partial(
-            replay.sample_batch,
+        given = dict(
             replay=state.replay,
             demonstrations=data.demonstrations,
             table=data.goals,
             achieved_goal=env.achieved_goal,
             epsilon=data.epsilon,
-            demo_rows=replay.num_demo_rows(state.env_steps, config.batch),
             config=config.batch,
         )
+        if config.batch.has_priorities:
+            key_batch, key_errors = jax.random.split(key_batch)
+            draw = functools.partial(replay.sample_prioritised_batch, **given)
+            batches, drawn = jax.vmap(draw)(jax.random.split(key_batch, config.updates_per_iteration))
+            state, metrics = _gradient_steps(key_updates, state, batches, data, env, config)
+            return _with_new_priorities(key_errors, state, batches, drawn, data, env, config), metrics
+        draw = functools.partial(replay.sample_batch, demo_rows=replay.num_demo_rows(state.env_steps, config.batch), **given)
         batches = jax.vmap(draw)(jax.random.split(key_batch, config.updates_per_iteration))
         return _gradient_steps(key_updates, state, batches, data, env, config)
 
@@ -254,10 +263,26 @@ def _gradient_steps(
         schedule = agents.schedule(progress, state.updates + index, config.agent, action_dim=env.action_dim)
         inputs = _network_inputs(batch, data.scale, env, config)
         agent, metrics = agents.update(key_update, agent, batch, **inputs, schedule=schedule, config=config.agent)
-        return (key, agent), {**metrics, "batch/relabelled": jnp.mean(batch.is_relabelled)}
+        shares = {"batch/relabelled": jnp.mean(batch.is_relabelled), "batch/demonstrations": jnp.mean(batch.is_demonstration)}
+        return (key, agent), {**metrics, **shares}
 
     (_, agent), metrics = jax.lax.scan(gradient_step, (key, state.agent), (jnp.arange(num_updates), batches))
     return state.replace(agent=agent, updates=state.updates + num_updates), jax.tree.map(jnp.mean, metrics)
+
+
+def _with_new_priorities(
+    key: Array, state: TrainState, batches: Transition, drawn: Drawn, data: Guidance, env: Environment, config: TrainConfig
+) -> TrainState:
+    """The drawn transitions, leaves (number, B, ...), get the priorities of their errors after the gradient steps."""
+
+    def errors_of(key: Array, batch: Transition) -> tuple[Array, Array]:
+        key, key_error = jax.random.split(key)
+        inputs = _network_inputs(batch, data.scale, env, config)
+        return key, agents.td_error(key_error, state.agent, batch, **inputs, config=config.agent)
+
+    _, errors = jax.lax.scan(errors_of, key, batches)
+    renewed = priorities.assign(state.replay.priorities, drawn, errors, config.batch)
+    return state.replace(replay=state.replay.replace(priorities=renewed))
 
 
 def _demonstration_batch(key: Array, data: Guidance, env: Environment, config: TrainConfig) -> Transition:

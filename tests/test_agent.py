@@ -321,7 +321,7 @@ def test_an_update_in_blocks_is_the_same_update(precision, monkeypatch):
         observation=rng.normal(size=(B, 2)),
         next_observation=rng.normal(size=(B, 2)),
         is_demonstration=np.arange(B) < 5,
-    )
+    ).replace(weight=jnp.asarray(rng.uniform(size=B), jnp.float32))
     start = jax.jit(lambda key: agents.init(key, config, observation_dim=2, goal_dim=1, action_dim=1))(jax.random.key(0))
     inputs, next_inputs = inputs_of(batch.observation, config), inputs_of(batch.next_observation, config)
 

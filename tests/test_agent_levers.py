@@ -132,6 +132,49 @@ def test_deterministic_policies_explore_with_noise_and_are_followed_by_a_target(
     assert sampled.max() == 1.0
 
 
+@pytest.mark.parametrize(
+    ("config", "constants", "targets", "expected"),
+    # Rows have rewards 0.5 and 4.5, and discount 0.5. Quantiles have the mean 2. Targets are 0.5 (-1, 0, 1, 2) = 0.25 on average, more than the
+    # reward: 0.75 and 4.75. Clipped to [0, 1] they are (0, 0.5, 1, 1) = 0.625 and 1; with the four largest of eight dropped -0.25 more than it.
+    [
+        (CONFIG, [[0.0, 1.0, 2.0, 3.0], [1.0, 2.0, 3.0, 4.0]], [[-1.0, 0.0, 1.0, 2.0]] * 2, (1.25, 2.75)),
+        (dataclasses.replace(CONFIG, clip_targets=True), [[0.0, 1.0, 2.0, 3.0], [1.0, 2.0, 3.0, 4.0]], [[-1.0, 0.0, 1.0, 2.0]] * 2, (1.375, 1.0)),
+        (dataclasses.replace(CONFIG, top_quantiles_to_drop_per_net=2), [2.0, 2.0], [[-1.0, 0.0, 1.0, 2.0]] * 2, (1.75, 2.25)),
+        (BASES["td3"], [3.0, 1.0], [-1.0, 5.0], (2.0, 2.0)),  # the mean of the critics, 2, and the least of the targets: 0 and 4
+        (BASES["ddpg"], [2.0], [-1.0], (2.0, 2.0)),
+    ],
+)
+def test_temporal_difference_errors_by_hand(config, constants, targets, expected):
+    start = fresh_agent(jax.random.key(0), config).replace(log_alpha=jnp.asarray(-30.0))
+    start = with_constant_critics(with_constant_critics(start, constants, target=False), targets)
+    batch = make_batch(action=ACTIONS, reward=np.tile([0.5, 4.5], B // 2), discount=0.5).replace(weight=jnp.full(B, 0.1))  # weights play no part
+    inputs = inputs_of(batch.observation, config)
+    errors = jax.jit(lambda key: agents.td_error(key, start, batch, inputs=inputs, next_inputs=inputs, config=config))(jax.random.key(0))
+    np.testing.assert_allclose(errors, np.tile(expected, B // 2), atol=1e-5)
+
+
+def test_rows_count_in_the_critics_loss_by_their_weights():
+    # Half the squared distance of 3 and 1 to the reward: (2 + 0) / 2 = 1 where that is 1, (0.5 + 0.5) / 2 = 0.5 where it is 2.
+    start = with_constant_critics(fresh_agent(jax.random.key(0), BASES["sac"]), [3.0, 1.0], target=False)
+    batch = make_batch(action=ACTIONS, reward=np.tile([1.0, 2.0], B // 2), discount=0.0)
+    losses = {}
+    for name, weight in (("none", None), ("ones", [1.0, 1.0]), ("some", [1.0, 0.25])):
+        weighted = batch.replace(weight=None if weight is None else jnp.tile(jnp.array(weight), B // 2))
+        losses[name] = float(one_update(start, weighted, BASES["sac"])[1]["critic/loss"])
+    assert losses == pytest.approx({"none": (1.0 + 0.5) / 2, "ones": (1.0 + 0.5) / 2, "some": (1.0 + 0.25 * 0.5) / 2}, abs=1e-5)
+
+
+@pytest.mark.parametrize("base", ["tqc", "td3"])
+def test_rows_of_weight_0_teach_the_critics_nothing(base):
+    config, first = {"tqc": CONFIG, **BASES}[base], np.arange(B) < B // 2
+    after = []
+    for other in (0.0, 7.0):
+        batch = make_batch(action=ACTIONS, reward=np.where(first, 1.0, other), discount=0.0).replace(weight=jnp.asarray(first, jnp.float32))
+        after.append(one_update(fresh_agent(jax.random.key(0), config), batch, config)[0])
+    chex.assert_trees_all_close(after[0].critic_optimiser, after[1].critic_optimiser, rtol=1e-5, atol=1e-7)
+    assert max(np.abs(leaf).max() for leaf in jax.tree.leaves(after[0].critic_optimiser.mu)) > 1e-3
+
+
 def test_a_random_subset_of_the_target_critics_is_asked():
     config = dataclasses.replace(CONFIG, num_critics=4, num_target_critics=2)
     start = with_constant_critics(fresh_agent(jax.random.key(0), config), [0.0, 1.0, 2.0, 4.0])

@@ -18,12 +18,13 @@ CORE = {
     "randomness": {"types"},
     "goals": {"types", "config", "randomness"},
     "relabel": {"types", "config", "randomness", "goals"},
-    "replay": {"errors", "types", "config", "randomness", "goals", "relabel"},
+    "priorities": {"types", "config"},
+    "replay": {"errors", "types", "config", "randomness", "goals", "relabel", "priorities"},
     "networks": {"types", "config"},
     "losses": {"types"},
     "agent": {"types", "config", "networks", "losses"},
     "rollout": {"types", "config", "randomness", "goals"},
-    "train": {"errors", "types", "config", "randomness", "goals", "relabel", "replay", "networks", "losses", "agent", "rollout"},
+    "train": {"errors", "types", "config", "randomness", "goals", "relabel", "priorities", "replay", "networks", "losses", "agent", "rollout"},
 }
 DRAWING = {"viewer", "drawing"}  # modules of envs that dynamics never import
 ENVS = sorted(path for path in (ROOT / "envs").rglob("*.py") if path.stem not in DRAWING)

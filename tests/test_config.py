@@ -77,6 +77,9 @@ BAD = [
     (BatchConfig, "terminate_on_relabel", [0]),
     (BatchConfig, "bound_by_obtained_return", [1, "yes"]),
     (BatchConfig, "timeouts_are_terminal", [None]),
+    (BatchConfig, "priority_exponent", [-0.1, 1.1, float("nan"), None]),
+    (BatchConfig, "importance_exponent", [-0.1, 1.1, None]),
+    (BatchConfig, "demo_priority_bonus", [-0.1, float("inf"), "1", 0.5]),  # 0.5 while transitions are drawn uniformly
     (GoalConfig, "m", [-1, 0.5]),
     (GoalConfig, "k", [-0.1, float("nan")]),
     (GoalConfig, "epsilon_filtering", [1]),
@@ -140,6 +143,11 @@ def test_bad_values_are_named(config, name, value):
         config(**{name: value})
 
 
+def test_the_share_of_demonstrations_follows_from_priorities_or_from_the_steps():
+    with pytest.raises(ValueError, match=r"reach_zero = 10 is of no use with priority_exponent = 0\.6.*set one of them to None or 0"):
+        BatchConfig(reach_zero=10, priority_exponent=0.6)
+
+
 def test_the_table_of_bad_values_is_complete():
     assert {(config, name) for config, name, _ in BAD} == set(FIELDS)
 
@@ -151,6 +159,7 @@ def test_the_table_of_bad_values_is_complete():
         lambda: AgentConfig(num_quantiles=25, top_quantiles_to_drop_per_net=24, target_entropy=-3.0, bc_weight=0, net_arch=(1,)),
         lambda: TrainConfig(algo="bc", steps=1, learning_starts=5),  # cloning takes no environment steps
         lambda: TrainConfig(demo_reset_ratio=1),
+        lambda: BatchConfig(priority_exponent=1, importance_exponent=0, demo_priority_bonus=100),
     ],
 )
 def test_values_at_the_edge_are_accepted(build):

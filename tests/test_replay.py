@@ -16,10 +16,11 @@ import pytest
 from hypothesis import strategies as st
 from toy_env import FAST_COMPILATION
 
+from hindrl_jax import priorities as prioritised
 from hindrl_jax import replay as replays
 from hindrl_jax.config import BatchConfig
 from hindrl_jax.goals import GoalTable
-from hindrl_jax.replay import num_demo_rows, sample_batch, sample_episodes, sample_steps, transitions
+from hindrl_jax.replay import num_demo_rows, sample_batch, sample_episodes, sample_prioritised_batch, sample_steps, transitions
 from hindrl_jax.types import Episodes
 
 NUM_ENVS, HORIZON, SLOTS = 2, 3, 4
@@ -61,6 +62,7 @@ def demonstrations():
     )
 
 
+PRIORITISED = BatchConfig(priority_exponent=0.5, demo_priority_bonus=3.0)
 DEMO_STATES = [(DEMO, i, t) for i, length in enumerate(DEMO_LENGTHS) for t in range(length + 1)]
 TABLE = GoalTable(goals=jnp.array([*DEMO_STATES, (np.nan,) * 3], jnp.float32), count=jnp.asarray(len(DEMO_STATES)))
 
@@ -70,6 +72,7 @@ def add_all(stream):
     """The replay after each of the steps in `stream`: leaves (NUM_ADDS, ...)."""
     dims = dict(horizon=HORIZON, observation_dim=3, action_dim=1, goal_dim=3)
     start = replays.init(num_envs=NUM_ENVS, capacity=NUM_ENVS * HORIZON * SLOTS + 5, keep_nearby_goals=True, **dims)
+    start = start.replace(priorities=prioritised.init(demonstrations(), start.episodes, PRIORITISED))
 
     def add(state, step):
         state = replays.add(state, **step)
@@ -247,24 +250,108 @@ def test_every_row_of_a_batch_comes_from_where_it_should(strategy):
         batch = jax.device_get(draw_batch(jax.random.key(step), at(history, step), NUM_DEMO, config))
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(batch))
         assert np.asarray(batch.is_demonstration).tolist() == [True] * NUM_DEMO + [False] * (64 - NUM_DEMO)
-        sources = kept(story[step])
-        states, nexts, goals = triples(batch.observation), triples(batch.next_observation), triples(batch.desired_goal)
-        for row, (state, goal) in enumerate(zip(states, goals, strict=True)):
-            env, episode, t = state
-            length = DEMO_LENGTHS[episode] if row < NUM_DEMO else sources[env, episode]  # a KeyError here: not a complete episode
-            assert (env == DEMO) == (row < NUM_DEMO)
-            assert t < length
-            allowed = allowed_goals(strategy, state, length, sources) if NUM_DEMO <= row < NUM_DEMO + NUM_RELABELLED else set()
-            relabelled = bool(allowed) if strategy != "mixture" else goal in allowed
-            assert batch.is_relabelled[row] == relabelled
-            assert goal in (allowed if relabelled else {(-1 - env, episode, 0)})
-            reward, discount, following = expected_return(state, length, goal, relabelled=relabelled, config=config)
-            assert (batch.reward[row], batch.discount[row]) == (reward, discount)  # exact, since gamma = 1/2
-            assert batch.obtained_return[row] == (0.0 if relabelled else reward_of(env, episode, length - 1) * 0.5 ** (length - 1 - t))
-            assert nexts[row] == following
-            assert batch.action[row, 0] == reward_of(env, episode, t)
+        hindsight = (np.arange(64) >= NUM_DEMO) & (np.arange(64) < NUM_DEMO + NUM_RELABELLED)
+        check_rows(batch, hindsight, kept(story[step]), strategy, config)
 
     check()
+
+
+def check_rows(batch, hindsight, sources, strategy, config):
+    """Each row is what a plain loop makes of the state that it begins in; `hindsight` says which rows are to be relabelled."""
+    states, nexts, goals = triples(batch.observation), triples(batch.next_observation), triples(batch.desired_goal)
+    for row, (state, goal) in enumerate(zip(states, goals, strict=True)):
+        env, episode, t = state
+        is_demonstration = batch.is_demonstration[row]
+        length = DEMO_LENGTHS[episode] if is_demonstration else sources[env, episode]  # a KeyError here: not a complete episode
+        assert (env == DEMO) == is_demonstration
+        assert t < length
+        allowed = allowed_goals(strategy, state, length, sources) if hindsight[row] else set()
+        relabelled = bool(allowed) if strategy != "mixture" else goal in allowed
+        assert batch.is_relabelled[row] == relabelled
+        assert goal in (allowed if relabelled else {(-1 - env, episode, 0)})
+        n_step = HORIZON if is_demonstration and config.demo_returns == "monte_carlo" else config.n_step
+        of_row = dataclasses.replace(config, n_step=n_step)
+        reward, discount, following = expected_return(state, length, goal, relabelled=relabelled, config=of_row)
+        assert (batch.reward[row], batch.discount[row]) == (reward, discount)  # exact, since gamma = 1/2
+        assert batch.obtained_return[row] == (0.0 if relabelled else reward_of(env, episode, length - 1) * 0.5 ** (length - 1 - t))
+        assert nexts[row] == following
+        assert batch.action[row, 0] == reward_of(env, episode, t)
+
+
+@functools.partial(jax.jit, static_argnames="config", compiler_options=FAST_COMPILATION)
+def draw_prioritised_batch(key, replay, config):
+    return sample_prioritised_batch(key, replay, demonstrations(), TABLE, achieved_goal=identity, epsilon=jnp.zeros(3), config=config)
+
+
+def with_random_priorities(replay, seed):
+    """The replay with other priorities wherever there are any, on the host."""
+    rng, priorities = np.random.default_rng(seed), replay.priorities
+    changed = [
+        np.where(table > 0.0, rng.uniform(0.5, 2.0, table.shape), 0.0).astype(np.float32) for table in (priorities.demonstrations, priorities.replay)
+    ]
+    return replay.replace(priorities=priorities.replace(demonstrations=changed[0], replay=changed[1]))
+
+
+@hypothesis.settings(deadline=None, max_examples=20)
+@hypothesis.given(lengths=LENGTHS, step=st.integers(0, NUM_ADDS - 1))
+@hypothesis.example(lengths=[[3], [3]], step=1)  # nothing is complete
+@hypothesis.example(lengths=[[3], [3]], step=2)
+@hypothesis.example(lengths=[[3], [3]], step=10)
+@hypothesis.example(lengths=[[3], [3]], step=11)
+@hypothesis.example(lengths=[[3], [3]], step=12)
+def test_exactly_the_transitions_of_complete_episodes_have_priorities(lengths, step):
+    history, story = replay_history(lengths)
+    replay = at(history, step)
+    priorities, observations = replay.priorities, replay.episodes.observations
+    expected = {(*source, t): 1.0 for source, length in kept(story[step]).items() for t in range(length)}
+    places = np.argwhere(priorities.replay > 0.0)
+    assert {tuple(map(int, observations[row, t])): priorities.replay[row, t] for row, t in places} == expected
+    assert len(places) == len(expected)
+    assert priorities.demonstrations.tolist() == [[2.0 * (t < length) for t in range(HORIZON)] for length in DEMO_LENGTHS]  # (1 + 3)^0.5
+
+
+@pytest.mark.parametrize("step", [2, 8, 10, 11, 12, 23, NUM_ADDS - 1])  # as above: nearly empty, full, and being written again
+def test_transitions_are_drawn_by_their_priorities_wherever_the_rings_stand(step):
+    history, story = replay_history([[3], [3, 1, 2]])
+    replay = with_random_priorities(at(history, step), step)
+    priorities, sources = replay.priorities, kept(story[step])
+    config = dataclasses.replace(BATCH, priority_exponent=0.5, importance_exponent=0.5, num_sampled_goals=0, batch_size=8192)
+    batch = jax.device_get(draw_prioritised_batch(jax.random.key(step), replay, config)[0])
+    total = priorities.demonstrations.sum() + priorities.replay.sum()
+    expected = {(DEMO, *map(int, place)): priorities.demonstrations[*place] / total for place in np.argwhere(priorities.demonstrations)}
+    for row, t in np.argwhere(priorities.replay):
+        expected[tuple(map(int, replay.episodes.observations[row, t]))] = priorities.replay[row, t] / total
+    assert len(expected) == sum(DEMO_LENGTHS) + sum(sources.values())
+    states, counts = np.unique(triples(batch.observation), axis=0, return_counts=True)
+    counted = {tuple(map(int, state)): count for state, count in zip(states, counts, strict=True)}
+    assert set(counted) <= set(expected)
+    for state, share in expected.items():
+        assert abs(counted.get(state, 0) - 8192 * share) < 5.0 * (8192 * share * (1.0 - share)) ** 0.5
+    # The weights are those of the probabilities: (1 / P)^0.5 over the largest of the batch.
+    weights = np.array([expected[state] for state in triples(batch.observation)]) ** -0.5
+    np.testing.assert_allclose(batch.weight, weights / weights.max(), rtol=1e-5)
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_every_row_of_a_prioritised_batch_comes_from_where_it_says(strategy):
+    changes = dict(priority_exponent=0.5, demo_priority_bonus=3.0, demo_returns="monte_carlo", hindrl_sampling_strategy=strategy.split()[-1])
+    config = dataclasses.replace(BATCH, **changes, **STRATEGIES[strategy])
+    history, story = replay_history([[3, 2], [1, 3]])
+    for step in (2, 11, 12, NUM_ADDS - 1):
+        replay = with_random_priorities(at(history, step), step)
+        batch, drawn = jax.device_get(draw_prioritised_batch(jax.random.key(step), replay, config))
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(batch))
+        assert batch.is_demonstration.tolist() == drawn.is_demonstration.tolist()
+        assert 0 < batch.is_demonstration.sum() < 64
+        replayed = np.flatnonzero(~batch.is_demonstration)
+        hindsight = np.isin(np.arange(64), replayed[: len(replayed) * 3 // 4])
+        check_rows(batch, hindsight, kept(story[step]), strategy, config)
+        tables = (replay.episodes, replay.priorities.replay), (jax.device_get(demonstrations()), replay.priorities.demonstrations)
+        for row, (state, is_demonstration) in enumerate(zip(triples(batch.observation), batch.is_demonstration, strict=True)):
+            episodes, priorities = tables[int(is_demonstration)]
+            place = drawn.rows[row], drawn.steps[row]
+            assert tuple(map(int, episodes.observations[*place])) == state
+            assert priorities[*place] == drawn.priority[row]
 
 
 def test_union_draws_from_both_sources_and_relabelling_can_be_off():

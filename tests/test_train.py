@@ -12,6 +12,7 @@ import pytest
 from toy_env import FAST_COMPILATION, Corridor, corridor_demonstrations
 
 from envs.grid import FixedGridPickAndPlace
+from hindrl_jax import replay as replays
 from hindrl_jax import rollout, train
 from hindrl_jax.agent import network_inputs
 from hindrl_jax.config import AgentConfig, BatchConfig, GoalConfig, TrainConfig
@@ -206,6 +207,100 @@ def test_the_replay_is_written_in_place(mapped, data):
     assert memory.temp_size_in_bytes < smallest
     assert memory.alias_size_in_bytes > replay
     assert memory.argument_size_in_bytes - memory.alias_size_in_bytes < smallest
+
+
+PRIORITISED = BatchConfig(
+    batch_size=16,
+    n_step=2,
+    hindrl_sampling_strategy="mixture",
+    strategy_mixture=(("future", 1.0), ("task_conditioned", 1.0), ("joint_intersection", 1.0)),
+    demo_returns="monte_carlo",
+    bound_by_obtained_return=True,
+    priority_exponent=0.5,
+    demo_priority_bonus=3.0,
+)
+
+
+def test_prioritised_training_over_two_seeds():
+    """With everything else that a batch can have. The priorities are finite, where they should be, no longer those of the start, and in place."""
+    env = make_env()
+    goal = GoalConfig(m=1, k=1.0)
+    agent = dataclasses.replace(make_config().agent, num_critics=3, num_target_critics=2, clip_targets=True)
+    config = make_config(batch=PRIORITISED, goal=goal, agent=agent)
+    data = train.guidance(corridor_demonstrations((1.0, 1.25, 0.9), env=env), env, config)
+
+    @functools.partial(jax.jit, compiler_options=FAST_COMPILATION)
+    @jax.vmap
+    def start(seed):
+        return train.collect(train.init(jax.random.key(seed), data, env, config), data, env=env, config=config, num_iterations=COLLECT_STEPS)
+
+    before = start(jnp.arange(2))
+    former = jax.device_get(before.replay.priorities)
+    learn = jax.vmap(functools.partial(train.learn, data=data, env=env, config=config, num_iterations=LEARN_STEPS))
+    learn = jax.jit(learn, donate_argnums=0, compiler_options=FAST_COMPILATION).lower(before).compile()
+    state, metrics = learn(before)
+    chex.assert_tree_all_finite((state.agent, metrics, state.replay.priorities))
+
+    for seed in range(2):
+        replay = jax.tree.map(lambda leaf, seed=seed: np.asarray(leaf[seed]), state.replay)
+        lengths, slots = replay.episodes.lengths, len(replay.episodes.lengths) // NUM_ENVS
+        complete = np.where(np.isin(np.arange(len(lengths)), np.arange(NUM_ENVS) * slots + replay.slot), 0, lengths)
+        priorities = replay.priorities
+        np.testing.assert_array_equal(priorities.replay > 0.0, np.arange(HORIZON)[None] < complete[:, None])
+        np.testing.assert_array_equal(priorities.demonstrations > 0.0, former.demonstrations[seed] > 0.0)
+        renewed = (priorities.replay > 0.0) & (priorities.replay != 1.0)
+        demonstrated = priorities.demonstrations != former.demonstrations[seed]
+        assert renewed.sum() > 10
+        assert demonstrated.sum() > 5
+        # Targets lie in [0, 1], as do hardly any errors by then. Demonstrations: at most 3 more; (1 + 3)^0.5 was their first priority.
+        assert priorities.demonstrations[demonstrated].min() > (3.0 + 1e-3) ** 0.5 - 1e-6
+        assert np.median(priorities.replay[renewed]) < 1.0
+        assert priorities.largest == max(1.0, priorities.replay.max())
+    # 14 demonstrated transitions of priority 2 and some 30 of priority 1 or less.
+    assert (metrics["batch/demonstrations"] > 0.2).all()
+
+    shape = f"f32[2,{','.join(map(str, former.replay.shape[1:]))}]"
+    text = learn.as_text()
+    assert f"= {shape}" in text
+    assert [line for line in text.splitlines() if f"= {shape}" in line and " copy" in line.split(shape, 1)[1].split("(", 1)[0]] == []
+    assert learn.memory_analysis().temp_size_in_bytes < former.replay.nbytes
+
+
+def test_drawn_transitions_get_the_errors_of_their_own_rows():
+    # Critics say 2 everywhere, their targets 1: the error is |2 - (reward + discount)|.
+    env, batch = make_env(), dataclasses.replace(PRIORITISED, bound_by_obtained_return=False, hindrl_sampling_strategy="final", strategy_mixture=())
+    config = make_config(batch=batch, goal=GoalConfig())
+    data = train.guidance(corridor_demonstrations((1.0, 1.25, 0.9), env=env), env, config)
+
+    def constant(critics, value):
+        last = critics["params"]["Dense_1"]
+        last = {"kernel": jnp.zeros_like(last["kernel"]), "bias": jnp.full_like(last["bias"], value)}
+        return {"params": {**critics["params"], "Dense_1": last}}
+
+    @functools.partial(jax.jit, compiler_options=FAST_COMPILATION)
+    def run(key):
+        key_init, key_draw, key_errors = jax.random.split(key, 3)
+        state = train.collect(train.init(key_init, data, env, config), data, env=env, config=config, num_iterations=20)
+        critics = dict(critics=constant(state.agent.critics, 2.0), target_critics=constant(state.agent.target_critics, 1.0))
+        state = state.replace(agent=state.agent.replace(**critics, log_alpha=jnp.asarray(-30.0)))
+        given = dict(replay=state.replay, demonstrations=data.demonstrations, table=data.goals, achieved_goal=env.achieved_goal)
+        draw = functools.partial(replays.sample_prioritised_batch, **given, epsilon=data.epsilon, config=batch)
+        batches, drawn = jax.vmap(draw)(jax.random.split(key_draw, 2))
+        return state, batches, drawn, train._with_new_priorities(key_errors, state, batches, drawn, data, env, config)
+
+    before, batches, drawn, after = jax.device_get(run(jax.random.key(0)))
+    errors = np.abs(2.0 - batches.reward - batches.discount) + 1e-3
+    for is_demonstration, name, bonus in ((True, "demonstrations", 3.0), (False, "replay", 0.0)):
+        expected = np.array(getattr(before.replay.priorities, name))
+        rows = np.argwhere(drawn.is_demonstration == is_demonstration)
+        places = {}
+        for row in map(tuple, rows):
+            places.setdefault((drawn.rows[row], drawn.steps[row]), []).append((errors[row] + bonus) ** 0.5)
+        for place, found in places.items():
+            expected[place] = max(found)
+        assert len(places) > 5
+        np.testing.assert_allclose(getattr(after.replay.priorities, name), expected, rtol=1e-5)
+    assert len(set(errors.ravel().round(3).tolist())) > 3
 
 
 def test_donated_state_is_consumed(data):
