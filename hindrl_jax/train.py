@@ -24,7 +24,7 @@ from hindrl_jax.randomness import uniform_index
 from hindrl_jax.relabel import hindsight_steps
 from hindrl_jax.replay import ReplayState
 from hindrl_jax.rollout import Act, Evaluation, RolloutState, StartTable
-from hindrl_jax.types import Array, Environment, Episodes, Transition, action_to_env
+from hindrl_jax.types import Array, Environment, Episodes, Transition, action_to_env, tree_where
 
 
 @struct.dataclass(kw_only=True)
@@ -176,8 +176,6 @@ def _interact(key: Array, state: TrainState, data: Guidance, env: Environment, c
     before, progress = state.rollout, _progress(state, config)
     action = act(key_act, before.observation, before.desired_goal)
     restarted = _new_episodes(key_reset, data, env, config, progress)
-    if config.goal.has_achieved_goals:
-        restarted = _with_achieved_goals(key_goals, restarted, state.replay, env, config, progress)
     after, time_step = rollout.step(before, restarted, action, env)
     nearby_goal = None
     if _uses_intersections(config):
@@ -195,6 +193,9 @@ def _interact(key: Array, state: TrainState, data: Guidance, env: Environment, c
         judged_by_goal=before.judged_by_goal,
         nearby_goal=nearby_goal,
     )
+    if config.goal.has_achieved_goals:  # read from what is stored by now: of the replay as it was, a copy would have to be kept
+        begun = _with_achieved_goals(key_goals, after, stored, env, config, progress)
+        after = tree_where(time_step.terminated | time_step.truncated, begun, after)
     return state.replace(replay=stored, rollout=after, env_steps=state.env_steps + action.shape[0])
 
 

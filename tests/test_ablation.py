@@ -243,7 +243,7 @@ def test_tables_by_hand(by_hand, tmp_path):
     assert "## small: FixedGridPickAndPlace, num_objects 1" in text
     assert "| default | 1/2 | >0k [0k, >0k] | 95.0 [90.0, 100.0] | 32.0 [24.0, 40.0] |  | 5.0 | 1.00 |" in text
     assert f"| {LEVERS[0].name} | 0/2 | >0k [>0k, >0k] | 50.0 [50.0, 50.0] | 7.0 [4.0, 10.0] | **-25.0 [-30.0, -20.0]** | 15.0 | 3.00 |" in text
-    assert text.index("| default |") < text.index("| *hindsight* |") < text.index(f"| {LEVERS[0].name} |")
+    assert text.index("| default |") < text.index(f"| *{LEVERS[0].group}* |") < text.index(f"| {LEVERS[0].name} |")
     assert f"| {LEVERS[0].name} | {LEVERS[0].summary} |" in text
     with Image.open(tmp_path / "ablation.png") as picture:
         assert min(picture.size) > 200

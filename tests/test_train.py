@@ -488,6 +488,14 @@ def test_achieved_goals_are_given_to_new_episodes_and_judge_them():
     np.testing.assert_array_equal(batch.desired_goal[~judged, 0], task_goal)
 
 
+def test_achieved_goals_cost_no_copy_of_the_replay(data):
+    config = make_config(goal=GoalConfig(achieved_goal_ratio=0.5))
+    state = jax.eval_shape(lambda key: train.init(key, data, make_env(), config), jax.random.key(0))
+    run = functools.partial(train.learn, env=make_env(), config=config, num_iterations=LEARN_STEPS)
+    memory = jax.jit(run, donate_argnums=0, compiler_options=FAST_COMPILATION).lower(state, data).compile().memory_analysis()
+    assert memory.temp_size_in_bytes < state.replay.episodes.actions.size * 4
+
+
 def test_the_share_of_achieved_goals_moves_linearly():
     env, goal = make_env(), GoalConfig(achieved_goal_ratio=0.8, final_achieved_goal_ratio=0.0)
     config = make_config(goal=goal, num_envs=500, buffer_size=500 * 2 * HORIZON, steps=10**6)
