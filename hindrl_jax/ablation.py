@@ -25,7 +25,7 @@ from flax.traverse_util import flatten_dict
 from hindrl_jax import plots
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.errors import UserError, one_line
-from hindrl_jax.experiment import Result, fit, record_demonstrations
+from hindrl_jax.experiment import Result, fit, record_demonstrations, steps_to_learn
 from hindrl_jax.presets import preset
 from hindrl_jax.registry import checked, make
 from hindrl_jax.runs import CONFIG, METRICS, SUMMARY, RunSpec, RunWriter, disk_trouble, read_spec
@@ -102,7 +102,7 @@ LEVERS: tuple[Lever, ...] = (
     Lever(
         "achieved-goals",
         "goals",
-        "half of the rollouts, falling to none, aim at states reached earlier; goals of demonstrations and rollouts (thesis, chapter 6)",
+        "as goals-joint-union, and half of the rollouts, falling to none, aim at states reached earlier (thesis, chapter 6)",
         (("goal.achieved_goal_ratio", 0.5), ("goal.final_achieved_goal_ratio", 0.0), ("batch.hindrl_sampling_strategy", "joint_union")),
     ),
     Lever("n-step-1", "targets", "1-step returns in place of 5 (thesis)", (("batch.n_step", 1),)),
@@ -112,7 +112,7 @@ LEVERS: tuple[Lever, ...] = (
     Lever(
         "bound-targets",
         "targets",
-        "targets at least the return obtained (self-imitation learning), and clipped to [0, 1]",
+        "as clip-targets, and targets at least the return obtained (self-imitation learning)",
         (("batch.bound_by_obtained_return", True), ("agent.clip_targets", True)),
     ),
     Lever(
@@ -137,7 +137,7 @@ LEVERS: tuple[Lever, ...] = (
     Lever(
         "q-filter",
         "demonstrations",
-        "cloning loss with weight 0.1 where the critics prefer the demonstrated action (Nair et al.)",
+        "as bc-0.1, where the critics prefer the demonstrated action (Nair et al.)",
         (("agent.q_filter", True), ("agent.bc_weight", 0.1)),
     ),
     Lever("value-normalised", "demonstrations", "value in the actor's loss over its mean size (TD3+BC)", (("agent.normalise_value", True),)),
@@ -182,7 +182,7 @@ LEVERS: tuple[Lever, ...] = (
     Lever(
         "prioritised",
         "replay",
-        "transitions drawn by their errors, demonstrations with a bonus (prioritised replay; DDPGfD)",
+        "transitions drawn by their errors, demonstrations with a bonus, which become few (prioritised replay; DDPGfD)",
         (("batch.priority_exponent", 0.6), ("batch.demo_priority_bonus", 1.0)),
     ),
     Lever("batch-1024", "replay", "batches of 1,024 rows in place of 256", (("batch.batch_size", 1_024),)),
@@ -290,9 +290,10 @@ def check_can_train(settings: Iterable[Setting], *, overwrite: bool) -> None:
     An interrupted run of the same setting does not: it is trained again.
 
     Raises:
-      UserError: if a directory holds something else and `overwrite` is off, or cannot be written.
+      UserError: if a directory holds something else and `overwrite` is off, or cannot be written, or a run is too short to learn.
     """
     for setting in settings:
+        steps_to_learn(setting.spec.env, setting.spec.config)
         if overwrite or not (setting.path / CONFIG).exists():
             RunWriter(setting.path, setting.spec, overwrite=overwrite)
             continue
@@ -467,7 +468,7 @@ _EXPLANATION = """# Ablation
 
 The default recipe with one change at a time, {seeds} seeds from {first}, {steps:,} environment steps each. Every change is trained with the same
 seeds, which have the same demonstrations. In brackets: 95% bootstrap intervals over the seeds, somewhat too narrow with 16 seeds and much too
-narrow with fewer than 8 or so. They describe single comparisons: of 40 changes without any effect, two or more would show a difference by chance.
+narrow with fewer than 8 or so. They describe single comparisons: of changes without any effect, one in twenty or more shows a difference by chance.
 
 - **95%**: seeds of which an evaluation along the run reached 95% success.
 - **steps to 95%**: environment steps to the first such evaluation, median over all seeds; > is said where the run ended before.

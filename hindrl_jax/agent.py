@@ -3,7 +3,9 @@
 One `update` serves TQCfD, HinDRL and Smooth HinDRL, which differ only in the batch they are given; `update_bc` is the BC baseline, on the
 same actor. Differences from the TQC paper (Kuznetsov et al., 2020): the loss is averaged, not summed, over quantiles (as in sb3-contrib,
 which the thesis used), and the discount comes with each transition, so that n-step returns and termination need no special case. By default
-also: inputs encoded at two scales, a target entropy that falls along the run, and a running average of the actor for evaluation.
+also: inputs encoded at two scales, a target entropy that falls along the run, and a running average of the actor for evaluation. With td3, the
+target critics move at every gradient step, also where the actor is delayed (in the paper both wait); a delayed actor saves no time, since its
+gradient is computed at every step.
 """
 
 from __future__ import annotations
@@ -209,7 +211,7 @@ def _num_blocks(batch_size: int, config: AgentConfig) -> int:
 
     Also 1 for a batch size that has no divisor near the number needed.
     """
-    if jax.default_backend() != "cpu":
+    if jax.default_backend() != "cpu" or config.normalise_value:  # which takes the mean size of the value over the whole batch
         return 1
     needed = -(-4 * max(config.net_arch) * batch_size // _BLOCK_BYTES)
     return next((blocks for blocks in range(needed, 2 * needed) if batch_size % blocks == 0), 1)
@@ -234,7 +236,7 @@ def update(
     Critic: quantile Huber loss towards the truncated atoms of r + discount (Z' - alpha log pi(a' | s')); for algorithms without quantiles the
       squared error to r + discount (min Q' - alpha log pi(a' | s')).
     Actor: mean(alpha log pi - value(s, a_pi)) + bc_weight * behaviour cloning loss; the value is the mean over critics and quantiles (tqc), the
-      least critic's (sac) or the first one's (td3, ddpg).
+      least critic's (sac; with REDQ's subsets the mean over critics) or the first one's (td3, ddpg).
 
     Args:
       key: random key.
@@ -349,7 +351,8 @@ def _value(critics: Params, inputs: Array, action: Array, config: AgentConfig) -
     if config.base == "tqc":
         return mean_return(critics, inputs, action, config)
     if config.base == "sac":
-        return jnp.min(apply_critics(critics, inputs, action, config)[:, 0], axis=0)
+        values = apply_critics(critics, inputs, action, config)[:, 0]
+        return jnp.min(values, axis=0) if config.num_target_critics is None else jnp.mean(values, axis=0)
     return apply_critics(jax.tree.map(lambda leaf: leaf[:1], critics), inputs, action, config)[0, 0]
 
 
@@ -363,7 +366,7 @@ def _actor_gradient(state: AgentState, schedule: Schedule, config: AgentConfig, 
             action, log_prob = distribution.mode, jnp.zeros(block.reward.shape)
         values = _value(state.critics, block.inputs, action, config)
         value, entropy = jnp.mean(values), -jnp.mean(log_prob)
-        size = jax.lax.stop_gradient(jnp.mean(jnp.abs(values))) if config.normalise_value else 1.0
+        size = jnp.maximum(jax.lax.stop_gradient(jnp.mean(jnp.abs(values))), _LEAST_EXTENT) if config.normalise_value else 1.0
         cloned = distribution.mode if config.bc_action == "mean" else action
         clonable = block.is_demonstration
         if config.q_filter:
@@ -396,7 +399,7 @@ def update_bc(state: AgentState, batch: Transition, *, inputs: Array, schedule: 
     """One gradient step of behaviour cloning alone: mean squared error of tanh(mean) to the demonstrated action (thesis eq. 4.1).
 
     Args:
-      state: the agent; only the actor and its optimiser change.
+      state: the agent; only the actor, what follows it, and its optimiser change.
       batch: B demonstration transitions.
       inputs: (B, input_dim) network inputs.
       schedule: its learning rate and averaging rate are used.
@@ -411,6 +414,12 @@ def update_bc(state: AgentState, batch: Transition, *, inputs: Array, schedule: 
         return jnp.mean(jnp.square(action.T - batch.action))
 
     value, gradient = jax.value_and_grad(loss)(state.actor)
-    actor, actor_optimiser = _descend(gradient, state.actor_optimiser, state.actor, schedule.learning_rate)
-    average_actor = optax.incremental_update(actor, state.average_actor, schedule.actor_average_rate)
-    return state.replace(actor=actor, average_actor=average_actor, actor_optimiser=actor_optimiser), {"actor/bc_loss": value}
+    actor, actor_optimiser = _descend(gradient, state.actor_optimiser, state.actor, schedule.learning_rate, max_norm=config.max_gradient_norm)
+    state = state.replace(
+        actor=actor,
+        actor_optimiser=actor_optimiser,
+        average_actor=optax.incremental_update(actor, state.average_actor, schedule.actor_average_rate),
+    )
+    if state.target_actor is not None:
+        state = state.replace(target_actor=optax.incremental_update(actor, state.target_actor, config.target_update_rate))
+    return state, {"actor/bc_loss": value}

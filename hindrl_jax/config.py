@@ -189,7 +189,7 @@ class AgentConfig:
     num_critics: int = 2
     """Number of critics."""
     num_target_critics: int | None = None
-    """Target critics drawn at random for each gradient step (REDQ; Chen et al., 2021); None takes all."""
+    """Target critics drawn at random for each gradient step (REDQ; Chen et al., 2021), the actor climbing the mean of all; None takes all."""
     num_quantiles: int = 25
     """Quantiles per critic."""
     top_quantiles_to_drop_per_net: int = 2
@@ -207,7 +207,7 @@ class AgentConfig:
     final_target_entropy: float | None = -10.0
     """Where the target entropy has moved, linearly, by the end of the run; None keeps it constant."""
     actor_delay: int = 1
-    """Gradient steps of the critics for each one of the actor and the entropy coefficient (TD3's delayed policy updates)."""
+    """Gradient steps of the critics for each one of the actor and the entropy coefficient (TD3's delayed policy updates). Saves no time here."""
     max_gradient_norm: float | None = None
     """Longer gradients are shortened to this length, those of the actor and of the critics each as a whole; None leaves them."""
     exploration_noise: float = 0.1
@@ -218,7 +218,7 @@ class AgentConfig:
     """For td3: the largest noise on the actions of the targets."""
     normalise_value: bool = False
     """Divide the value in the actor's loss by its mean size over the batch, so that bc_weight weighs alike whatever the values are (TD3+BC,
-    Fujimoto and Gu, 2021)."""
+    Fujimoto and Gu, 2021). The entropy's share of the loss stays as it is."""
     bc_weight: float = 0.01
     """Weight of the behaviour cloning loss on demonstration rows (lambda_BC of the thesis)."""
     final_bc_weight: float | None = None
@@ -299,7 +299,7 @@ class TrainConfig:
     """Share of the run over which those states widen from the end of each demonstration to all of it: a reverse curriculum (RFCL, Tao et al.,
     2024, widens by success instead). 0 draws from all of them throughout."""
     bc_warm_start: int = 0
-    """Gradient steps of behaviour cloning alone before the first of reinforcement learning."""
+    """Gradient steps of behaviour cloning alone before the first of reinforcement learning, after the random actions of learning_starts."""
     pretrain_updates: int = 0
     """Gradient steps of actor and critics on demonstrations alone, after the warm start and before the first on mixed batches (DQfD, Hester et
     al., 2018; DDPGfD, Vecerik et al., 2017)."""
@@ -327,6 +327,12 @@ class TrainConfig:
         )
         if self.demo_reset_curriculum > 0.0 and self.demo_reset_ratio == 0.0:
             raise ValueError(f"demo_reset_curriculum = {self.demo_reset_curriculum} is of no use while demo_reset_ratio = 0: raise that, too")
+        if self.algo == "bc":
+            given = {"bc_warm_start": self.bc_warm_start, "pretrain_updates": self.pretrain_updates, "q_filter": self.agent.q_filter}
+            given |= {"priority_exponent": self.batch.priority_exponent, "base": self.agent.base != "tqc" and self.agent.base}
+            for name, value in given.items():
+                if value:
+                    raise ValueError(f"{name} = {value} has no effect on bc, which is behaviour cloning alone: drop it, or choose another algo")
         if self.algo == "tqcfd" and self.batch.num_sampled_goals > 0:
             raise ValueError(f"tqcfd does not relabel, but num_sampled_goals = {self.batch.num_sampled_goals}: set it to 0, or choose hindrl")
         if self.algo == "smooth-hindrl" and not self.goal.epsilon_filtering:
@@ -365,8 +371,12 @@ def without_effect(config: TrainConfig, name: str) -> str | None:
     relabelled = config.batch.num_sampled_goals > 0
     if name == "union_sampling_ratio" and not (relabelled and config.batch.hindrl_sampling_strategy == "joint_union"):
         return "only relabelling by joint_union uses it: choose --hindrl-sampling-strategy joint_union"
-    if name == "k" and (config.goal.m == 0 or not (relabelled or config.goal.epsilon_filtering)):
-        return "epsilon depends on it only for m > 0, and is used only for relabelling and the filter: add --m 5"
+    if name == "k" and config.goal.m == 0:
+        return "epsilon depends on it only for m > 0: add --m 5"
+    if name == "k" and not (relabelled or config.goal.epsilon_filtering or config.goal.has_achieved_goals):
+        return "epsilon is used only for relabelling, achieved goals and the filter: choose --algo hindrl"
+    if name in ("bc_weight", "final_bc_weight") and config.batch.max_demo_rows == 0 and not config.batch.has_priorities:
+        return "the batch has no demonstration rows to clone: raise --max-demo-ratio"
     return None
 
 

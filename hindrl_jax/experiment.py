@@ -167,6 +167,18 @@ def check_trainable(env: RestorableEnvironment) -> None:
         raise UserError(f"{env.name} cannot be trained in robosuite, which steps one arm outside JAX: train with backend closed_form or mjx")
 
 
+def steps_to_learn(env: RestorableEnvironment, config: TrainConfig) -> int:
+    """What is left of `config.steps` after the random steps at the start.
+
+    Raises:
+      UserError: if nothing is.
+    """
+    at_random = 0 if config.algo == "bc" else training.warm_up_iterations(env, config) * config.num_envs
+    if config.steps <= at_random:
+        raise UserError(f"steps = {config.steps} ends within the {at_random} random steps before learning: raise steps")
+    return config.steps - at_random
+
+
 def fit(
     env: RestorableEnvironment,
     demonstrations: Episodes | Sequence[Episodes],
@@ -301,9 +313,7 @@ class _Programs:
         config = configs[0]
         cloning = config.algo == "bc"
         self.warm_up, per_iteration = (0, 1) if cloning else (training.warm_up_iterations(env, config), config.num_envs)
-        to_learn = config.steps - self.warm_up * per_iteration
-        if to_learn < 1:
-            raise UserError(f"steps = {config.steps} ends within the {self.warm_up * per_iteration} random steps before learning: raise steps")
+        to_learn = steps_to_learn(env, config)
         self.chunk = max(1, min(config.eval_every // CHUNKS_PER_EVALUATION, to_learn) // per_iteration)
         self.values = {name: np.asarray([sweepable_value(c, name) for c in configs], np.float32) for name in _swept_fields(configs)}
         self.mesh = seed_mesh(len(configs))

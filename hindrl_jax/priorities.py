@@ -5,6 +5,7 @@ was last drawn, plus a constant (Schaul et al., prioritised experience replay, 2
 demonstrations and replay are one table (DDPGfD, Vecerik et al., 2017). Differences from the papers:
   * The error is that of the mean, |mean of the critics' atoms - mean of the targets|. DDPGfD squares it and adds the actor's gradient.
   * New transitions are given the largest priority so far without the bonus, which is to set demonstrations apart from them.
+  * Rows that are relabelled keep the priority of their transition, whichever goal its error was measured under.
   * No tree of sums: an episode is drawn by the sum of its priorities, then a step of it. One pass over all priorities serves all batches of an
     iteration, there is nothing to be kept in step with them, and in float32 no sum runs over more than the episodes.
 """

@@ -10,7 +10,8 @@ Sources of goals (Andrychowicz et al., HER, 2017; Davchev et al., HinDRL, 2021; 
 
 The strategy joint_union takes task_conditioned with probability `union_sampling_ratio`, else future (eq. 4.4); mixture takes any sources with any
 weights. A row whose intersection is empty is not relabelled. What lies within epsilon of what is noted while an episode is lived
-(`goals.nearby_goal`), which makes the intersection, "exceptionally slow" in the thesis, as cheap as the others.
+(`goals.nearby_goal`), which makes the intersection, "exceptionally slow" in the thesis, nearly as cheap as the others. Differences from HinDRL in the
+form that takes demonstrated goals: one goal near each state is noted for good, so a goal is drawn by the states that it lies near.
 """
 
 from __future__ import annotations

@@ -294,7 +294,7 @@ def _replay_rows(
         new_goals, found = _new_goals(key, replay, rows, steps, table, achieved_goal=achieved_goal, config=config)
         relabelled &= found
     # A row of an episode that is judged by its behavioural goal is read as if that were a goal chosen in hindsight.
-    return transitions(
+    batch = transitions(
         replay.episodes,
         rows,
         steps,
@@ -306,12 +306,13 @@ def _replay_rows(
         n_step=config.n_step,
         config=config,
     )
+    return batch.replace(is_relabelled=relabelled)
 
 
-def _demonstration_rows(
+def demonstration_rows(
     demonstrations: Episodes, rows: Array, steps: Array, *, achieved_goal: Callable[[Array], Array], epsilon: Array, config: BatchConfig
 ) -> Transition:
-    """Reads rows of the demonstrations, which are never relabelled."""
+    """Reads rows of the demonstrations, which are never relabelled: rows and steps (B,) int32 -> the batch."""
     return transitions(
         demonstrations,
         rows,
@@ -367,7 +368,7 @@ def sample_batch(
         return batch
 
     demo = uniform_index(key_demo, (config.max_demo_rows,), num_demos)
-    demo_batch = _demonstration_rows(demonstrations, demo, sample_steps(key_demo_step, demonstrations, demo), **read)
+    demo_batch = demonstration_rows(demonstrations, demo, sample_steps(key_demo_step, demonstrations, demo), **read)
     head = jax.tree.map(lambda leaf: leaf[: config.max_demo_rows], batch)
     head = tree_where(index[: config.max_demo_rows] < demo_rows, demo_batch, head)
     return jax.tree.map(lambda leaf, first: leaf.at[: config.max_demo_rows].set(first), batch, head)
@@ -399,6 +400,6 @@ def sample_prioritised_batch(
     replayed = ~drawn.is_demonstration
     relabelled = replayed & (jnp.cumsum(replayed) <= _num_relabelled(jnp.sum(replayed), config))  # the first of them: all are drawn alike
     from_replay = _replay_rows(key_goal, replay, drawn.rows, drawn.steps, relabelled, table, **read)
-    from_demonstrations = _demonstration_rows(demonstrations, drawn.rows, drawn.steps, **read)
+    from_demonstrations = demonstration_rows(demonstrations, drawn.rows, drawn.steps, **read)
     batch = tree_where(replayed, from_replay, from_demonstrations)
     return batch.replace(weight=prioritised.importance_weights(drawn, config)), drawn

@@ -290,18 +290,9 @@ def _demonstration_batch(key: Array, data: Guidance, env: Environment, config: T
     """A batch of demonstration rows alone."""
     key_demo, key_step = jax.random.split(key)
     rows = uniform_index(key_demo, (config.batch.batch_size,), data.demonstrations.lengths.shape[0])
-    return replay.transitions(
-        data.demonstrations,
-        rows,
-        replay.sample_steps(key_step, data.demonstrations, rows),
-        achieved_goal=env.achieved_goal,
-        new_goals=data.demonstrations.desired_goals[rows],
-        relabelled=jnp.zeros(rows.shape, bool),
-        epsilon=data.epsilon,
-        is_demonstration=True,
-        n_step=config.batch.n_step,
-        config=config.batch,
-    )
+    steps = replay.sample_steps(key_step, data.demonstrations, rows)
+    read = dict(achieved_goal=env.achieved_goal, epsilon=data.epsilon, config=config.batch)
+    return replay.demonstration_rows(data.demonstrations, rows, steps, **read)
 
 
 def clone(state: TrainState, data: Guidance, *, env: Environment, config: TrainConfig, num_iterations: int) -> tuple[TrainState, Metrics]:

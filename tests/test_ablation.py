@@ -320,6 +320,7 @@ def test_files_that_are_not_ours_are_not_replaced(tmp_path, capsys):
         (["--seeds", "1"], "an interval needs at least 2"),
         (["--seed", "-1"], "--seed -1 is not usable"),
         (["--steps", "0"], "steps = 0"),
+        (["--steps", "10"], "steps = 10 ends within"),
         (["--step", "100"], "did you mean --steps?"),
     ],
 )

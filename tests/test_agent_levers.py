@@ -222,6 +222,32 @@ def test_normalised_value_is_one_whatever_the_rewards_are():
     np.testing.assert_allclose(normalised["actor/value"], plain["actor/value"], rtol=1e-5)
 
 
+def test_the_size_of_the_value_is_that_of_the_whole_batch(monkeypatch):
+    # Blocks of a batch have sizes of their own; so the batch is not cut, however small the cache.
+    monkeypatch.setattr(agents, "_BLOCK_BYTES", 100)
+    config = dataclasses.replace(CONFIG, normalise_value=True)
+    assert agents._num_blocks(B, CONFIG) > 1
+    assert agents._num_blocks(B, config) == 1
+    # |1| and |-3| have a mean of 2, and the mean value -1 over it is -1/2; values of 0 are left as they are.
+    columns = agents._Columns(
+        inputs=jnp.zeros((3, B)),
+        next_inputs=jnp.zeros((3, B)),
+        action=jnp.zeros((1, B)),
+        reward=jnp.zeros(B),
+        discount=jnp.zeros(B),
+        is_demonstration=jnp.zeros(B, bool),
+        obtained_return=None,
+        noise=jnp.zeros((1, B)),
+        next_noise=jnp.zeros((1, B)),
+    )
+    start = fresh_agent(jax.random.key(0)).replace(log_alpha=jnp.asarray(-30.0))
+    for given, loss in ((np.where(np.arange(B) % 2, 1.0, -3.0), 0.5), (np.zeros(B), 0.0)):
+        monkeypatch.setattr(agents, "_value", lambda *_, given=given: jnp.asarray(given, jnp.float32))
+        gradient, metrics = agents._actor_gradient(start, SCHEDULE, config, columns)
+        np.testing.assert_allclose(metrics["actor/loss"], loss, atol=1e-5)
+        chex.assert_tree_all_finite(gradient)
+
+
 def test_the_filter_clones_only_what_is_better_than_the_policys_own_action():
     # The value is 1 - |action|. Demonstrations play 0.9 in (0, 0), which is bad, and 0 in (1, 1), which is best.
     kind = np.arange(B) % 4
@@ -252,6 +278,13 @@ def test_weight_of_cloning_moves_linearly_or_not_at_all():
         metrics = agents.update(jax.random.key(0), start, batch, inputs=inputs, next_inputs=inputs, schedule=schedule, config=CONFIG)[1]
         losses.append(float(metrics["actor/loss"]))
     np.testing.assert_allclose(losses[1] - losses[0], 2.0 * metrics["actor/bc_loss"], rtol=1e-3)
+
+
+def test_with_subsets_sac_climbs_the_mean_of_all_critics():
+    config = dataclasses.replace(BASES["sac"], num_critics=3, num_target_critics=2)
+    start = with_constant_critics(fresh_agent(jax.random.key(0), config), (0.0, 1.0, 5.0), target=False)
+    metrics = one_update(start, make_batch(action=ACTIONS, reward=0.0, discount=0.0), config)[1]
+    np.testing.assert_allclose(metrics["actor/value"], 2.0, atol=0.15)
 
 
 def test_ddpg_has_one_critic():

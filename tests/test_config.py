@@ -179,6 +179,21 @@ def test_the_algorithm_must_fit_its_settings(fitting, contradiction, name):
         dataclasses.replace(config, **contradiction)
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        dict(bc_warm_start=1),
+        dict(pretrain_updates=1),
+        dict(agent=AgentConfig(q_filter=True)),
+        dict(agent=AgentConfig(base="sac")),
+        dict(batch=BatchConfig(priority_exponent=0.5)),
+    ],
+)
+def test_cloning_alone_refuses_what_it_would_ignore(changes):
+    with pytest.raises(ValueError, match="has no effect on bc"):
+        TrainConfig(algo="bc", **changes)
+
+
 def test_rollout_conditioned_is_the_name_of_the_thesis_for_future():
     assert BatchConfig(hindrl_sampling_strategy="rollout_conditioned") == BatchConfig(hindrl_sampling_strategy="future")
     assert BatchConfig(hindrl_sampling_strategy="rollout_conditioned").hindrl_sampling_strategy == "future"

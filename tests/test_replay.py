@@ -416,7 +416,7 @@ def test_episodes_judged_by_their_goal_are_rewarded_for_reaching_it(n_step):
         in_hindsight = row < 64 // 3
         assert goal == ((env, episode, 3) if in_hindsight else (0, episode, 2) if env == 0 else (-2, episode, 0))
         by_goal = in_hindsight or env == 0
-        assert batch.is_relabelled[row] == by_goal
+        assert batch.is_relabelled[row] == in_hindsight
         reward, discount, following = expected_return(state, 3, goal, relabelled=by_goal, config=config)
         assert (batch.reward[row], batch.discount[row], *batch.next_observation[row]) == (reward, discount, *following)
         kinds.add((env, in_hindsight))

@@ -479,13 +479,13 @@ def test_achieved_goals_are_given_to_new_episodes_and_judge_them():
     assert len(set(goals.tolist())) > 10
     assert achieved_goals >= len(np.flatnonzero(replay.episodes.lengths)) - 2 * NUM_ENVS  # all but the first episodes, when there was no past
     # Rows of those episodes are rewarded for their goal alone, and only where it is reached exactly; the others by the environment.
-    judged = batch.is_relabelled
+    judged = batch.desired_goal[:, 0] != task_goal
     assert judged.sum() > 0
+    assert not batch.is_relabelled.any()
     reached = batch.next_observation[:, 2] == batch.desired_goal[:, 0]
     np.testing.assert_array_equal(batch.reward[judged], reached[judged])
     solved = batch.next_observation[:, 2] > env.width
     np.testing.assert_array_equal(batch.discount == 0.0, (judged & reached) | solved)
-    np.testing.assert_array_equal(batch.desired_goal[~judged, 0], task_goal)
 
 
 def test_achieved_goals_cost_no_copy_of_the_replay(data):
@@ -534,6 +534,14 @@ def test_warm_start_clones_and_pretraining_teaches_the_critics_before_any_mixed_
     action = act(jax.random.key(0), data.demonstrations.observations[:, 0], data.demonstrations.desired_goals)
     np.testing.assert_allclose(action[:, 1], -0.5, atol=0.2)
 
+    td3 = dataclasses.replace(agent, base="td3", max_gradient_norm=1e-3)
+    config = make_config(agent=td3, batch=batch, bc_warm_start=300)
+    start = train.init(jax.random.key(0), data, env, config)
+    warm = jax.jit(lambda state: train.pretrain(state, data, env=env, config=config), compiler_options=FAST_COMPILATION)(start)
+    chex.assert_trees_all_close(warm.agent.target_actor, warm.agent.actor, atol=0.1)  # it has followed
+    moved = jax.tree.map(lambda old, new: float(np.abs(old - new).max()), start.agent.target_actor, warm.agent.target_actor)
+    assert max(jax.tree.leaves(moved)) > 0.1
+
     start, trained = after(bc_warm_start=100, pretrain_updates=300)
     assert (int(trained.updates), int(trained.env_steps)) == (400, 0)
     chex.assert_tree_all_finite(trained.agent)
@@ -544,6 +552,14 @@ def test_warm_start_clones_and_pretraining_teaches_the_critics_before_any_mixed_
         inputs = network_inputs(table.observations[rows, step], table.observations[rows, step, 2:], table.desired_goals, data.scale, agent)
         values = jnp.mean(apply_critics(trained.agent.critics, inputs.T, table.actions[rows, step].T, agent), axis=(0, 1))
         np.testing.assert_allclose(values, 0.5 ** (steps_left - 1), atol=0.2)
+
+
+@pytest.mark.parametrize("returns", ["n_step", "monte_carlo"])
+def test_pretraining_sees_the_returns_that_are_asked_for(data, returns):
+    config = make_config(batch=BatchConfig(batch_size=64, n_step=1, demo_returns=returns))
+    batch = train._demonstration_batch(jax.random.key(0), data, make_env(), config)
+    assert batch.is_demonstration.all()
+    assert set((np.asarray(batch.discount) > 0).tolist()) == ({False} if returns == "monte_carlo" else {False, True})
 
 
 def test_demonstrations_without_states_cannot_be_begun_in():
