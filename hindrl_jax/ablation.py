@@ -25,7 +25,7 @@ from flax.traverse_util import flatten_dict
 from hindrl_jax import plots
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.errors import UserError, one_line
-from hindrl_jax.experiment import Result, fit, record_demonstrations, steps_to_learn
+from hindrl_jax.experiment import Result, fit, record_demonstrations
 from hindrl_jax.presets import preset
 from hindrl_jax.registry import checked, make
 from hindrl_jax.runs import CONFIG, METRICS, SUMMARY, RunSpec, RunWriter, disk_trouble, read_spec
@@ -290,10 +290,9 @@ def check_can_train(settings: Iterable[Setting], *, overwrite: bool) -> None:
     An interrupted run of the same setting does not: it is trained again.
 
     Raises:
-      UserError: if a directory holds something else and `overwrite` is off, or cannot be written, or a run is too short to learn.
+      UserError: if a directory holds something else and `overwrite` is off, or cannot be written.
     """
     for setting in settings:
-        steps_to_learn(setting.spec.env, setting.spec.config)
         if overwrite or not (setting.path / CONFIG).exists():
             RunWriter(setting.path, setting.spec, overwrite=overwrite)
             continue

@@ -32,7 +32,7 @@ from hindrl_jax import STARTED, __version__, ablation
 from hindrl_jax.config import SWEEPABLE, TrainConfig, without_effect
 from hindrl_jax.datasets import DemonstrationSummary, check_can_write, describe_demonstrations, load_demonstrations, read_states, save_demonstrations
 from hindrl_jax.errors import UserError, one_line
-from hindrl_jax.experiment import Result, check_trainable, fit, record_demonstrations
+from hindrl_jax.experiment import Result, check_trainable, fit, record_demonstrations, steps_to_learn
 from hindrl_jax.goals import epsilon_filter, epsilon_from_demonstrations, goal_table
 from hindrl_jax.plots import save_filter
 from hindrl_jax.presets import ORIGINAL_RULES, Preset, preset
@@ -664,6 +664,8 @@ def _reproduce_ablation(arguments: list[str]) -> None:
     # The tables hold all that is there, also from an earlier start with other levers, so all of it must be of the same options.
     everything = settings_of(tasks=ablation.ABLATION_TASKS, levers=ablation.LEVERS)
     ablation.check_can_train(settings if options.overwrite else everything, overwrite=options.overwrite)
+    for setting in settings:
+        steps_to_learn(setting.spec.env, setting.spec.config)
     to_train = [setting for setting in settings if not ablation.is_finished(setting)]
     kept = len(settings) - len(to_train)
     console.print(f"{_count(len(to_train), 'setting')} to train, {_count(options.seeds, 'seed')} from {options.seed}, {kept} finished before")
