@@ -6,7 +6,7 @@ PEERS_PIP = benchmarks/$(PIP) -r benchmarks/requirements-peers.txt
 .PHONY: train test test-slow lint bench clean
 
 train: .venv/.installed  ## one demonstration, one seed, about a minute
-	.venv/bin/hindrl train --env FixedGridPickAndPlace --algo hindrl --demos 1 --seeds 1 --out runs/quickstart --overwrite
+	.venv/bin/hindrl train --env FixedGridPickAndPlace --algo hindrl --demos 1 --seed 2 --out runs/quickstart --overwrite
 
 test: .venv/.installed-test  ## two files at a time; more would need 5 GiB of memory each
 	.venv/bin/python -m pytest --numprocesses auto --maxprocesses 2 --dist loadfile
