@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from hindrl_jax.config import AgentConfig
+from hindrl_jax.config import AgentConfig, linear_schedule
 from hindrl_jax.losses import behaviour_cloning, entropy_coefficient, quantile_huber, squared_error, target_atoms, target_value
 from hindrl_jax.networks import Params, apply_actor, apply_critics, init_actor, init_critics, mean_return
 from hindrl_jax.types import Array, Transition, tree_where
@@ -165,16 +165,12 @@ def schedule(progress: Array | float, updates: Array | int, config: AgentConfig,
       updates: gradient steps so far.
       config, action_dim: of the agent.
     """
-
-    def between(start: float, end: float | None) -> Array | float:
-        return start if end is None else start + (end - start) * progress
-
     entropy = -float(action_dim) if config.target_entropy is None else config.target_entropy
     return Schedule(
-        learning_rate=between(config.learning_rate, config.final_learning_rate),
-        target_entropy=between(entropy, config.final_target_entropy),
+        learning_rate=linear_schedule(config.learning_rate, config.final_learning_rate, progress),
+        target_entropy=linear_schedule(entropy, config.final_target_entropy, progress),
         actor_average_rate=jnp.minimum(config.actor_average_rate, 1.0 / (1.0 + config.actor_average_span * updates)),
-        bc_weight=between(config.bc_weight, config.final_bc_weight),
+        bc_weight=linear_schedule(config.bc_weight, config.final_bc_weight, progress),
     )
 
 
@@ -380,19 +376,28 @@ def _actor_gradient(state: AgentState, schedule: Schedule, config: AgentConfig, 
 
 
 def _move_actor(state: AgentState, gradient: Params, entropy: Array, schedule: Schedule, config: AgentConfig) -> tuple[AgentState, Metrics]:
-    """The actor's step, and that of what depends on it: its average, its target and the entropy coefficient."""
-    actor, actor_optimiser = _descend(gradient, state.actor_optimiser, state.actor, schedule.learning_rate, max_norm=config.max_gradient_norm)
-    state = state.replace(
-        actor=actor,
-        actor_optimiser=actor_optimiser,
-        average_actor=optax.incremental_update(actor, state.average_actor, schedule.actor_average_rate),
-    )
+    """The actor's step, and that of what depends on it: what follows it, and the entropy coefficient."""
+    state = _step_actor(state, gradient, schedule, config)
     if not config.has_entropy:
-        return state.replace(target_actor=optax.incremental_update(actor, state.target_actor, config.target_update_rate)), {}
+        return state, {}
     loss, gradient = jax.value_and_grad(entropy_coefficient)(state.log_alpha, -entropy, target_entropy=schedule.target_entropy)
     log_alpha, alpha_optimiser = _descend(gradient, state.alpha_optimiser, state.log_alpha, schedule.learning_rate)
     metrics = {"alpha/loss": loss, "alpha/value": jnp.exp(state.log_alpha)}
     return state.replace(log_alpha=log_alpha, alpha_optimiser=alpha_optimiser), metrics
+
+
+def _step_actor(state: AgentState, gradient: Params, schedule: Schedule, config: AgentConfig) -> AgentState:
+    """The actor's step, and one move of what follows it: its average and, where there is one, its target."""
+    actor, actor_optimiser = _descend(gradient, state.actor_optimiser, state.actor, schedule.learning_rate, max_norm=config.max_gradient_norm)
+    target_actor = state.target_actor
+    if target_actor is not None:
+        target_actor = optax.incremental_update(actor, target_actor, config.target_update_rate)
+    return state.replace(
+        actor=actor,
+        actor_optimiser=actor_optimiser,
+        average_actor=optax.incremental_update(actor, state.average_actor, schedule.actor_average_rate),
+        target_actor=target_actor,
+    )
 
 
 def update_bc(state: AgentState, batch: Transition, *, inputs: Array, schedule: Schedule, config: AgentConfig) -> tuple[AgentState, Metrics]:
@@ -414,12 +419,4 @@ def update_bc(state: AgentState, batch: Transition, *, inputs: Array, schedule: 
         return jnp.mean(jnp.square(action.T - batch.action))
 
     value, gradient = jax.value_and_grad(loss)(state.actor)
-    actor, actor_optimiser = _descend(gradient, state.actor_optimiser, state.actor, schedule.learning_rate, max_norm=config.max_gradient_norm)
-    state = state.replace(
-        actor=actor,
-        actor_optimiser=actor_optimiser,
-        average_actor=optax.incremental_update(actor, state.average_actor, schedule.actor_average_rate),
-    )
-    if state.target_actor is not None:
-        state = state.replace(target_actor=optax.incremental_update(actor, state.target_actor, config.target_update_rate))
-    return state, {"actor/bc_loss": value}
+    return _step_actor(state, gradient, schedule, config), {"actor/bc_loss": value}

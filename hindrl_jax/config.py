@@ -357,6 +357,16 @@ SWEEPABLE: dict[str, Literal["batch", "goal", "agent"]] = {
 """The fields that only enter arithmetic, and their sections: configs that differ in nothing else share one compiled program."""
 
 
+def linear_schedule(start: Any, end: Any, progress: Any) -> Any:
+    """Where a value is that moves linearly along a run: its field holds the start, the field named final_... the end, None if it does not move.
+
+    Args:
+      start, end: numbers, or () arrays where they are swept.
+      progress: share of the run that is over, in [0, 1].
+    """
+    return start if end is None else start + (end - start) * progress
+
+
 def sweepable_value(config: TrainConfig, name: str) -> float | None:
     """The value of a field of `SWEEPABLE`."""
     return getattr(getattr(config, SWEEPABLE[name]), name)

@@ -158,7 +158,7 @@ def nearby_goal(key: Array, table: GoalTable, achieved_goals: Array, epsilon: Ar
       (E,) int32 row of the table, -1 where no goal is near.
     """
     num_goals = table.goals.shape[0]
-    index_bits = max(num_goals.bit_length(), 1)
+    index_bits = num_goals.bit_length()
     row = jnp.arange(num_goals, dtype=jnp.uint32)
     # The row's number plus 1, below random bits: the maximum over rows is a random row, and says which.
     label = (jax.random.bits(key, (num_goals,)) << index_bits) | (row + 1)

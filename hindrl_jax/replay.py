@@ -22,7 +22,7 @@ from hindrl_jax.config import BatchConfig, Source
 from hindrl_jax.errors import UserError
 from hindrl_jax.goals import GoalTable, goal_reached, sample_goals
 from hindrl_jax.priorities import Drawn, Priorities
-from hindrl_jax.randomness import uniform_index
+from hindrl_jax.randomness import uniform_in_groups, uniform_index
 from hindrl_jax.relabel import choose_sources, hindsight_steps, intersection_steps
 from hindrl_jax.types import Array, Episodes, Transition, tree_where
 
@@ -140,10 +140,7 @@ def sample_episodes(key: Array, replay: ReplayState, num_samples: int) -> Array:
     At least one episode must be complete; else the rows are meaningless.
     """
     slots = replay.episodes.lengths.shape[0] // replay.slot.shape[0]
-    cumulative = jnp.cumsum(replay.num_complete)
-    drawn = uniform_index(key, (num_samples,), jnp.maximum(cumulative[-1], 1))
-    env = jnp.searchsorted(cumulative, drawn, side="right", method="compare_all")
-    age = cumulative[env] - drawn  # 1 for the newest episode of that environment
+    env, age = uniform_in_groups(key, num_samples, replay.num_complete)  # age 1: the newest episode of that environment
     return env * slots + (replay.slot[env] - age) % slots
 
 

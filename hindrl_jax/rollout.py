@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from hindrl_jax.goals import GoalTable, sample_goals
-from hindrl_jax.randomness import uniform_index
+from hindrl_jax.randomness import uniform_in_groups
 from hindrl_jax.types import Array, Environment, TimeStep, action_to_env, tree_where
 
 Act = Callable[[Array, Array, Array], Array]
@@ -48,10 +48,7 @@ def sample_starts(key: Array, table: StartTable, num_starts: int, *, share: Arra
       (num_starts, S).
     """
     eligible = jnp.clip(jnp.ceil(share * table.lengths).astype(jnp.int32), 1, table.lengths)
-    cumulative = jnp.cumsum(eligible)
-    drawn = uniform_index(key, (num_starts,), cumulative[-1])
-    demo = jnp.searchsorted(cumulative, drawn, side="right", method="compare_all")
-    steps_left = cumulative[demo] - drawn  # 1 .. eligible
+    demo, steps_left = uniform_in_groups(key, num_starts, eligible)
     return table.states[demo, table.lengths[demo] - steps_left]
 
 

@@ -16,7 +16,7 @@ from flax import struct
 from hindrl_jax import agent as agents
 from hindrl_jax import goals, priorities, replay, rollout
 from hindrl_jax.agent import AgentState, InputScale, Metrics
-from hindrl_jax.config import TrainConfig
+from hindrl_jax.config import TrainConfig, linear_schedule
 from hindrl_jax.errors import UserError
 from hindrl_jax.goals import GoalTable
 from hindrl_jax.priorities import Drawn
@@ -141,8 +141,8 @@ def _with_achieved_goals(
 ) -> RolloutState:
     """New episodes, a share of which are given a goal from the replay and are judged by it; none before the replay holds an episode."""
     key_choice, key_row, key_step = jax.random.split(key, 3)
-    num_envs, first, last = config.num_envs, config.goal.achieved_goal_ratio, config.goal.final_achieved_goal_ratio
-    share = first if last is None else first + (last - first) * progress
+    num_envs = config.num_envs
+    share = linear_schedule(config.goal.achieved_goal_ratio, config.goal.final_achieved_goal_ratio, progress)
     rows = replay.sample_episodes(key_row, past, num_envs)
     steps = hindsight_steps(key_step, jnp.zeros_like(rows), past.episodes.lengths[rows], source="episode")
     chosen = jax.random.bernoulli(key_choice, share, (num_envs,)) & (jnp.sum(past.num_complete) > 0)

@@ -7,26 +7,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probe import ACTIONS, CONFIG, SCHEDULE, B, fresh_agent, inputs_of, last, make_batch, mean_action, train, values
+from probe import ACTIONS, CONFIG, SCHEDULE, B, fresh_agent, inputs_of, last, make_batch, mean_action, train, values, with_constant_critics
 
 from hindrl_jax import agent as agents
 from hindrl_jax.config import AgentConfig
 
 BASES = {
+    "tqc": CONFIG,
     "sac": dataclasses.replace(CONFIG, base="sac"),
     "td3": dataclasses.replace(CONFIG, base="td3", actor_delay=2),
     "ddpg": dataclasses.replace(CONFIG, base="ddpg", num_critics=1),
 }
-
-
-def with_constant_critics(state, constants, *, target=True):
-    """The state with (target) critics that say a constant each, whatever they see: constants (N,) or (N, Q)."""
-    name = "target_critics" if target else "critics"
-    critics = getattr(state, name)["params"]
-    last_layer = critics["Dense_1"]
-    bias = jnp.broadcast_to(jnp.asarray(constants, jnp.float32).reshape(last_layer["bias"].shape[0], -1), last_layer["bias"].shape)
-    last_layer = {"kernel": jnp.zeros_like(last_layer["kernel"]), "bias": bias}
-    return state.replace(**{name: {"params": {**critics, "Dense_1": last_layer}}})
 
 
 def with_constant_action(actor, action):
@@ -34,6 +25,13 @@ def with_constant_action(actor, action):
     last_layer = actor["params"]["Dense_1"]
     last_layer = {"kernel": jnp.zeros_like(last_layer["kernel"]), "bias": jnp.array([np.arctanh(action), -5.0], jnp.float32)}
     return {"params": {**actor["params"], "Dense_1": last_layer}}
+
+
+def columns(**given):
+    """A batch of B columns of zeros, but for what is given."""
+    zero, row = jnp.zeros(B), jnp.zeros((1, B))
+    zeros = dict(inputs=jnp.zeros((3, B)), next_inputs=jnp.zeros((3, B)), action=row, noise=row, next_noise=row, reward=zero, discount=zero)
+    return agents._Columns(**(zeros | dict(is_demonstration=jnp.zeros(B, bool), obtained_return=None) | given))
 
 
 def one_update(state, batch, config, key=0):
@@ -64,7 +62,7 @@ def test_policy_picks_the_rewarded_action(base):
     batch = make_batch(action=ACTIONS, reward=1.0 - (ACTIONS[:, 0] - 0.5) ** 2, discount=0.0)
     states, metrics = train(3, batch, BASES[base])
     np.testing.assert_allclose(mean_action(last(states), batch.observation), 0.5, atol=0.2)
-    assert ("alpha/value" in metrics) == (base == "sac")
+    assert ("alpha/value" in metrics) == (base in ("tqc", "sac"))
 
 
 @pytest.mark.parametrize(("base", "constants", "expected"), [("sac", (3.0, 1.0), 1.5), ("td3", (3.0, 1.0), 1.5), ("ddpg", (3.0,), 2.5)])
@@ -92,18 +90,7 @@ def test_targets_assume_the_target_actors_action_with_clipped_noise(base, noise,
     config = dataclasses.replace(BASES[base], target_noise=noise, target_noise_clip=0.3)
     start = fresh_agent(jax.random.key(0), config)
     start = start.replace(actor=with_constant_action(start.actor, -0.5), target_actor=with_constant_action(start.target_actor, 0.5))
-    columns = agents._Columns(
-        inputs=jnp.zeros((3, B)),
-        next_inputs=jnp.zeros((3, B)),
-        action=jnp.zeros((1, B)),
-        reward=jnp.zeros(B),
-        discount=jnp.ones(B),
-        is_demonstration=jnp.zeros(B, bool),
-        obtained_return=None,
-        noise=jnp.zeros((1, B)),
-        next_noise=jax.random.normal(jax.random.key(1), (1, B)),
-    )
-    action, bonus = agents._next_action(start, config, columns)
+    action, bonus = agents._next_action(start, config, columns(next_noise=jax.random.normal(jax.random.key(1), (1, B))))
     assert np.all(np.asarray(bonus) == 0.0)
     lowest, highest = expected
     if noise in (0.0, 1e6) or base == "ddpg":
@@ -229,21 +216,10 @@ def test_the_size_of_the_value_is_that_of_the_whole_batch(monkeypatch):
     assert agents._num_blocks(B, CONFIG) > 1
     assert agents._num_blocks(B, config) == 1
     # |1| and |-3| have a mean of 2, and the mean value -1 over it is -1/2; values of 0 are left as they are.
-    columns = agents._Columns(
-        inputs=jnp.zeros((3, B)),
-        next_inputs=jnp.zeros((3, B)),
-        action=jnp.zeros((1, B)),
-        reward=jnp.zeros(B),
-        discount=jnp.zeros(B),
-        is_demonstration=jnp.zeros(B, bool),
-        obtained_return=None,
-        noise=jnp.zeros((1, B)),
-        next_noise=jnp.zeros((1, B)),
-    )
     start = fresh_agent(jax.random.key(0)).replace(log_alpha=jnp.asarray(-30.0))
     for given, loss in ((np.where(np.arange(B) % 2, 1.0, -3.0), 0.5), (np.zeros(B), 0.0)):
         monkeypatch.setattr(agents, "_value", lambda *_, given=given: jnp.asarray(given, jnp.float32))
-        gradient, metrics = agents._actor_gradient(start, SCHEDULE, config, columns)
+        gradient, metrics = agents._actor_gradient(start, SCHEDULE, config, columns())
         np.testing.assert_allclose(metrics["actor/loss"], loss, atol=1e-5)
         chex.assert_tree_all_finite(gradient)
 
