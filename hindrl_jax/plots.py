@@ -87,7 +87,8 @@ def save_ablation(outcomes: Sequence[Outcome], path: Path) -> None:
             label.set(fontweight="bold")
     _tidy(grid[0])
     seeds = len(outcomes[0].setting.spec.seeds)
-    figure.suptitle(f"one change to the default recipe, {seeds} seeds, 95% intervals; blue better, red worse, grey open", x=0.01, ha="left")
+    legend = f"{seeds} seeds, 95% intervals; blue better, red worse, grey open"
+    figure.suptitle(f"One change to the default recipe\n{legend}", x=0.01, ha="left", fontsize="medium")  # as wide as a single panel
     figure.savefig(path, dpi=130)
     plt.close(figure)
 
