@@ -31,6 +31,7 @@ from hindrl_jax.datasets import describe_demonstrations, load_demonstrations, sa
 from hindrl_jax.errors import UserError
 from hindrl_jax.experiment import fit
 from hindrl_jax.goals import GoalTable
+from hindrl_jax.registry import make
 from hindrl_jax.runs import Run, RunSpec, load_run
 from hindrl_jax.train import make_policy
 from hindrl_jax.types import action_to_env
@@ -390,7 +391,7 @@ def test_evaluation_counts_what_is_solved(run):
 
 def test_evaluation_elsewhere_is_refused(run, tmp_path, capsys):
     assert "backend = 'gazebo' is not usable: it must be one of closed_form, mjx, robosuite" in refusal(capsys, "eval", run, "--backend", "gazebo")
-    grid = Run(tmp_path, RunSpec(cli.make("GridPickAndPlace"), TrainConfig(), "1", (0,)), None, None, None)
+    grid = Run(tmp_path, RunSpec(make("GridPickAndPlace"), TrainConfig(), "1", (0,)), None, None, None)
     with pytest.raises(UserError, match="GridPickAndPlace has one back end only"):
         grid.in_backend("robosuite")
 

@@ -1,0 +1,91 @@
+"""The `hindrl` command. Every failure that is the user's to mend is one line on standard error and exit code 2."""
+
+from __future__ import annotations
+
+import os
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from hindrl_jax import __version__
+from hindrl_jax.cli import demonstrations, environments, playing, reproduction, training
+from hindrl_jax.errors import UserError, one_line
+from hindrl_jax.registry import did_you_mean
+
+Command = Callable[[list[str]], None]
+COMMANDS: dict[str, Command | dict[str, Command]] = {
+    "train": training.train,
+    "sweep": training.sweep,
+    "eval": playing.evaluate,
+    "render": playing.render,
+    "demos": {"record": demonstrations.record, "info": demonstrations.info, "plot": demonstrations.plot, "render": demonstrations.render},
+    "reproduce": {"ablation": reproduction.ablate},
+    "envs": environments.show,
+}
+
+
+def _usage() -> str:
+    lines = [f"hindrl {__version__}: learn sparse-reward tasks from a handful of demonstrations", ""]
+    for name, command in COMMANDS.items():
+        for words, function in [(name, command)] if callable(command) else [(f"{name} {sub}", f) for sub, f in command.items()]:
+            lines.append(f"  hindrl {words:<20}{function.__doc__}")
+    return "\n".join([*lines, "", "Each takes --help."])
+
+
+def _find(arguments: list[str]) -> tuple[Command, list[str]]:
+    commands: Any = COMMANDS
+    words = "hindrl"
+    while isinstance(commands, dict):
+        if not arguments or arguments[0] not in commands:
+            given = (
+                f"{arguments[0]!r} is not a command of {words!r}{did_you_mean(arguments[0], commands)}" if arguments else f"{words!r} needs a command"
+            )
+            raise UserError(f"{given}: choose one of {', '.join(commands)}")
+        words, commands, arguments = f"{words} {arguments[0]}", commands[arguments[0]], arguments[1:]
+    return commands, arguments
+
+
+def _set_up_jax() -> None:
+    """Settings that the user should not have to know, unless set by the user.
+
+    Compiled programs are kept in the user's cache folder, so that a second start takes seconds. JAX_COMPILATION_CACHE_DIR names another folder,
+    JAX_ENABLE_COMPILATION_CACHE=false turns it off. Each core counts as a device, so that several seeds are spread over the cores:
+    a core is busier with a seed of its own than with its share of every operation. JAX_NUM_CPU_DEVICES=1 turns that off.
+    """
+    if jax.config.jax_compilation_cache_dir is None:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hindrl_jax"
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+    if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    if "JAX_NUM_CPU_DEVICES" not in os.environ and "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        jax.config.update("jax_num_cpu_devices", cores or 1)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point of the `hindrl` command; with arguments given, runs within this process as it is."""
+    if arguments is None:
+        arguments = sys.argv[1:]
+        _set_up_jax()
+    *group, last = arguments or [""]
+    if last in ("--help", "-h") and (not group or (len(group) == 1 and isinstance(COMMANDS.get(group[0]), dict))):
+        print(_usage())
+        return
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_, **__: print(f"hindrl: warning: {message}", file=sys.stderr)
+            command, rest = _find(arguments)
+            command(rest)
+    except UserError as error:
+        print(f"hindrl: {one_line(error)}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("hindrl: interrupted", file=sys.stderr)
+        sys.exit(130)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)

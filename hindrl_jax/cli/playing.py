@@ -1,0 +1,82 @@
+"""`hindrl eval` and `hindrl render`: what the policies of a run do."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import tyro
+from rich import box
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from experts.recording import on_host
+from hindrl_jax.cli.common import console, counted, episode_key, parse
+from hindrl_jax.errors import UserError
+from hindrl_jax.runs import load_run
+
+
+@dataclasses.dataclass(frozen=True)
+class Eval:
+    """Play fresh episodes with the policies of a run."""
+
+    directory: tyro.conf.Positional[Path]
+    """Directory of the run."""
+    episodes: int = 100
+    """Episodes per seed."""
+    seed: int = 0
+    """Which episodes: equal numbers give equal ones, in the same back end."""
+    stochastic: bool = False
+    """Sample the actions instead of taking the mean ones."""
+    backend: str | None = None
+    """Simulate the environment with another of its back ends, for example robosuite, which plays one episode after the other."""
+
+
+def evaluate(arguments: list[str]) -> None:
+    """Play fresh episodes with the policies of a run."""
+    options = parse(Eval, arguments, "hindrl eval")
+    if options.episodes < 1:
+        raise UserError(f"--episodes {options.episodes} is too few: play at least 1")
+    run = load_run(options.directory)
+    if options.backend is not None:
+        run = run.in_backend(options.backend)
+    columns = (TextColumn("{task.completed}/{task.total} episodes"), BarColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not on_host(run.spec.env)) as progress:
+        bar = progress.add_task("", total=options.episodes * len(run.spec.seeds))
+        outcomes = run.evaluate(
+            episodes=options.episodes,
+            key=episode_key(options.seed),
+            stochastic=options.stochastic,
+            report=lambda played: progress.update(bar, completed=played),
+        )
+    table = Table("seed", "success", "length", box=box.SIMPLE_HEAD)
+    where = f" in {options.backend}" if options.backend else ""
+    console.print(f"{run.spec.env.name}{where}, {counted(options.episodes, 'episode')} per seed")
+    for outcome in outcomes:
+        table.add_row(str(outcome["seed"]), f"{outcome['success']:.1%}", f"{outcome['episode_length']:.1f}")
+    console.print(table)
+
+
+@dataclasses.dataclass(frozen=True)
+class Render:
+    """Film an episode of a run's policy."""
+
+    directory: tyro.conf.Positional[Path]
+    """Directory of the run."""
+    to: Path | None = None
+    """A .gif file, or a .png file for the last state (default: in DIRECTORY, named after episode and seed)."""
+    seed: int | None = None
+    """Whose policy: one of the run's seeds (default: the first)."""
+    episode: int = 0
+    """Which episode: equal numbers give equal ones."""
+    stochastic: bool = False
+    """Sample the actions instead of taking the mean ones."""
+
+
+def render(arguments: list[str]) -> None:
+    """Film an episode of a run's policy."""
+    options = parse(Render, arguments, "hindrl render")
+    run = load_run(options.directory)
+    path = options.to or options.directory / f"episode_{options.episode}_seed_{run.spec.seeds[0] if options.seed is None else options.seed}.gif"
+    solved = run.render(path, seed=options.seed, key=episode_key(options.episode), stochastic=options.stochastic)
+    console.print(f"wrote {path}: the episode is {'solved' if solved else 'not solved'}")

@@ -1,0 +1,107 @@
+"""`hindrl reproduce ...`: experiments on the recipe itself."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+from rich import box
+from rich.table import Table
+
+from hindrl_jax import ablation
+from hindrl_jax.cli.common import console, counted, parse, seeds_from
+from hindrl_jax.cli.progress import add_bar, advance, progress_bars
+from hindrl_jax.errors import UserError
+from hindrl_jax.experiment import steps_to_learn
+from hindrl_jax.registry import did_you_mean
+
+
+@dataclasses.dataclass(frozen=True)
+class Ablation:
+    """Options of `hindrl reproduce ablation`."""
+
+    out: Path = Path("runs/ablation")
+    """Directory of the tables and of all runs. Started again with the same options, what is finished there is kept and the rest is trained."""
+    tasks: tuple[str, ...] = ()
+    """What to train on: fixed-1, fixed-5 or random-50, the fixed or the random grid with that many demonstrations (default: all)."""
+    levers: tuple[str, ...] = ()
+    """The changes to train, next to the recipe as it is (default: all; --list shows them)."""
+    seeds: int = 16
+    """Number of seeds, side by side; the same for all changes. With fewer than 8 or so the intervals are much too narrow."""
+    seed: int = 2_000
+    """The first seed; the others follow it."""
+    steps: int | None = None
+    """Environment steps of each run (default: the recipe's)."""
+    overwrite: bool = False
+    """Replace runs that were made with other options. To train one again with the same options, remove its directory."""
+    list: bool = False
+    """Show the changes there are, and train nothing."""
+
+
+def ablate(arguments: list[str]) -> None:
+    """Train the default recipe with one change at a time, and compare."""
+    options = parse(Ablation, arguments, "hindrl reproduce ablation", ablate.__doc__)
+    if options.list:
+        console.print(_lever_table())
+        return
+    tasks = _chosen(options.tasks, ablation.ABLATION_TASKS, "--tasks")
+    levers = {lever.name: lever for lever in ablation.LEVERS}
+    names = _chosen(options.levers, levers, "--levers")
+    if options.seeds < 2:
+        raise UserError(f"--seeds {options.seeds} is too few: an interval needs at least 2")
+    settings_of = functools.partial(ablation.settings_of, options.out, seeds=seeds_from(options.seeds, options.seed), steps=options.steps)
+    settings = settings_of(tasks=tasks, levers=[levers[name] for name in names])
+    # The tables hold all that is there, also from an earlier start with other levers, so all of it must be of the same options.
+    everything = settings_of(tasks=ablation.ABLATION_TASKS, levers=ablation.LEVERS)
+    ablation.check_can_train(settings if options.overwrite else everything, overwrite=options.overwrite)
+    for setting in settings:
+        steps_to_learn(setting.spec.env, setting.spec.config)
+    to_train = [setting for setting in settings if not ablation.is_finished(setting)]
+    kept = len(settings) - len(to_train)
+    console.print(f"{counted(len(to_train), 'setting')} to train, {counted(options.seeds, 'seed')} from {options.seed}, {kept} finished before")
+
+    started = time.perf_counter()
+    with progress_bars(transient=True) as progress:
+        for trained, setting in enumerate(to_train, 1):
+            name = f"{setting.task} {setting.lever.name}: "
+            bar = add_bar(progress, setting.spec.config, name=name)
+            ablation.train(setting, report=functools.partial(advance, progress, bar, name=name))
+            progress.remove_task(bar)
+            outcomes = ablation.outcomes_of(everything)
+            ablation.write_tables(options.out, outcomes)
+            left = len(to_train) - trained
+            minutes = (time.perf_counter() - started) / trained * left / 60
+            (outcome,) = (outcome for outcome in outcomes if outcome.setting == setting)
+            progress.console.print(_outcome_line(outcome) + (f"   {left} left, about {minutes:,.0f} min" if left else ""))
+    if not to_train:
+        ablation.write_tables(options.out, ablation.outcomes_of(everything))
+    console.print(f"wrote {options.out}: {ablation.TABLE}, {ablation.TEXT}, {ablation.PICTURE}, and a run's directory for each setting")
+
+
+def _chosen(names: Sequence[str], known: Iterable[str], flag: str) -> list[str]:
+    """The chosen ones of what is known, each once and in the order in which they are known; all of them where none is chosen."""
+    known = list(known)
+    for name in names:
+        if name not in known:
+            raise UserError(f"{flag} {name} is not known{did_you_mean(name, known)}: choose among {', '.join(known)}")
+    return [name for name in known if name in names or not names]
+
+
+def _lever_table() -> Table:
+    table = Table("lever", "group", "what it changes", box=box.SIMPLE_HEAD)
+    for lever in ablation.LEVERS:
+        table.add_row(lever.name, lever.group, lever.summary)
+    return table
+
+
+def _outcome_line(outcome: ablation.Outcome) -> str:
+    spec, steps = outcome.setting.spec, outcome.steps_to_95.estimate
+    median = f"median {steps:9,.0f} steps" if np.isfinite(steps) else f"median {'never':>9}      "
+    return (
+        f"{outcome.setting.task:<10}{outcome.setting.lever.name:<22}{outcome.seeds_reaching_95:3d} of {len(spec.seeds)} reach 95%, {median}   "
+        f"final {outcome.final_success.estimate:4.0%}   {outcome.seconds_per_seed * len(spec.seeds):6.1f} s"
+    )

@@ -1,0 +1,294 @@
+"""`hindrl train` and `hindrl sweep`."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import itertools
+import re
+import time
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import jax
+import numpy as np
+import tyro
+from rich import box
+from rich.table import Table
+
+from hindrl_jax import STARTED
+from hindrl_jax.cli.common import console, counted, parse, peek, seeds_from
+from hindrl_jax.cli.progress import add_bar, advance, progress_bars
+from hindrl_jax.config import SWEEPABLE, TrainConfig, without_effect
+from hindrl_jax.datasets import load_demonstrations
+from hindrl_jax.errors import UserError, one_line
+from hindrl_jax.experiment import Result, check_trainable, fit, record_demonstrations
+from hindrl_jax.presets import ORIGINAL_RULES, Preset, preset
+from hindrl_jax.registry import TASKS, checked, did_you_mean, make, task
+from hindrl_jax.runs import FROM_PYTHON, RunSpec, RunWriter, SweepWriter, read_spec, summarise
+from hindrl_jax.types import Episodes
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainOptions:
+    """Options of `hindrl train` and `hindrl sweep` that belong to the run as a whole."""
+
+    demos: str = "1"
+    """Demonstrations: a number to record with the task's expert for each seed, or an HDF5 file that all seeds share."""
+    seeds: int | None = None
+    """Number of seeds trained side by side (default: 1)."""
+    seed: int | None = None
+    """The first seed; the others follow it (default: 0)."""
+    out: Path | None = None
+    """Directory of the run (default: runs/ENV_ALGO_TIME, for a sweep runs/ENV_ALGO_sweep_TIME)."""
+    overwrite: bool = False
+    """Replace a run that is already there."""
+    distributed: bool = False
+    """Share the seeds with other hosts: start the same command on each of them. The first one writes. Clusters that JAX knows (SLURM, Open
+    MPI, Kubernetes, TPU) need nothing else; others need the three options below."""
+    coordinator: str | None = None
+    """With --distributed: address of the first host, as HOST:PORT."""
+    num_hosts: int | None = None
+    """With --distributed: number of hosts."""
+    host: int | None = None
+    """With --distributed: which of them this is, from 0."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SweepOptions(TrainOptions):
+    """Options of `hindrl sweep`."""
+
+    over: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """A field and its values, as in learning_rate=1e-4,3e-4,1e-3. Given several times, all combinations are trained, with all their seeds side by
+    side in one compiled program. The field is one that only enters arithmetic: learning_rate, bc_weight, gamma, ..."""
+
+
+def train(arguments: list[str]) -> None:
+    """Train policies from demonstrations."""
+    spec, options = parse_train(arguments)
+    out = options.out or _default_out(spec)
+    writer = RunWriter(out, spec, overwrite=options.overwrite)
+    with _hosts(options) as writes:
+        result = _fit(spec, [spec.config], [writer] if writes else [])
+        if writes:
+            summary = writer.finish(result)
+            console.print(_summary_table(summary))
+            console.print(_speed_line(summary))
+            console.print(f"wrote {out}: {', '.join(writer.files())}")
+
+
+def sweep(arguments: list[str]) -> None:
+    """Train with several values of hyperparameters, side by side."""
+    spec, options = parse_train(arguments, SweepOptions, "hindrl sweep")
+    settings = list(_grid(options.over, spec.config))
+    out = options.out or _default_out(spec, "sweep")
+    writer = checked(lambda: SweepWriter(out, spec, settings, overwrite=options.overwrite))
+    with _hosts(options) as writes:
+        result = _fit(spec, [run.spec.config for run in writer.runs], writer.runs if writes else [])
+        if writes:
+            console.print(_sweep_table(writer.finish(result), list(settings[0])))
+            console.print(_speed_line(summarise(result)))
+            console.print(f"wrote {out}: sweep.csv, sweep.png, and a run's directory for each setting")
+
+
+def _sweep_table(rows: Sequence[dict[str, Any]], swept: Sequence[str]) -> Table:
+    unit = next(name for name in rows[0] if name.startswith("median_")).split("_")[1]
+    table = Table(*swept, "95% reached", f"median {unit}", "mean final", "worst", box=box.SIMPLE_HEAD)
+    for row in rows:
+        median = row[f"median_{unit}_to_95"]
+        table.add_row(
+            *(f"{row[name]:g}" for name in swept),
+            f"{row['seeds_reaching_95']} of {row['seeds']}",
+            "never" if median is None else f"{median:,.0f}",
+            f"{row['mean_final_success']:.0%}",
+            f"{row['worst_final_success']:.0%}",
+        )
+    return table
+
+
+def _default_out(spec: RunSpec, *words: str) -> Path:
+    return Path("runs") / "_".join([spec.env.name, spec.config.algo, *words, time.strftime("%Y%m%d_%H%M%S")])
+
+
+def _grid(over: Sequence[str], config: TrainConfig) -> Iterator[dict[str, float]]:
+    """All combinations of the values of --over, in order."""
+    values: dict[str, list[float]] = {}
+    for given in over:
+        name, _, listed = given.partition("=")
+        name = name.strip().lstrip("-").replace("-", "_")
+        if name not in SWEEPABLE:
+            raise UserError(f"--over {given}: {name!r} cannot be swept{did_you_mean(name, SWEEPABLE)}; choose one of {', '.join(SWEEPABLE)}")
+        if name in values:
+            raise UserError(f"--over {given}: {name} is given twice; list all its values in one --over")
+        try:
+            values[name] = [float(value) for value in listed.split(",")]
+        except ValueError:
+            raise UserError(f"--over {given} is not a field and its values: write for example --over {name}=0.1,0.2") from None
+        if len(set(map(np.float32, values[name]))) < len(values[name]):
+            raise UserError(f"--over {given}: a value is listed twice (values are rounded to float32)")
+        reason = without_effect(config, name)
+        if reason:
+            raise UserError(f"--over {given} would change nothing: {reason}")
+    if not values:
+        raise UserError("--over is missing: say what to sweep, for example --over learning_rate=1e-4,3e-4,1e-3")
+    return (dict(zip(values, combination, strict=True)) for combination in itertools.product(*values.values()))
+
+
+@contextlib.contextmanager
+def _hosts(options: TrainOptions) -> Iterator[bool]:
+    """Joins the other hosts, if there are any; yields whether this is the host that writes and prints."""
+    given = {name: getattr(options, name) for name in ("coordinator", "num_hosts", "host")}
+    if not options.distributed:
+        for name, value in given.items():
+            if value is not None:
+                raise UserError(f"--{name.replace('_', '-')} is for training on several hosts: add --distributed, or drop it")
+        yield True
+        return
+    coordinator, num_hosts, host = given.values()
+    if any(value is None for value in given.values()) and any(value is not None for value in given.values()):
+        raise UserError("--coordinator, --num-hosts and --host belong together: give all three, or none where the cluster tells JAX")
+    if coordinator is not None and not re.fullmatch(r"\S+:\d+", coordinator):
+        raise UserError(f"--coordinator {coordinator} is not an address: write HOST:PORT")
+    if num_hosts is not None and not 0 <= host < num_hosts:
+        raise UserError(f"--host {host} is not one of --num-hosts {num_hosts}: count hosts from 0")
+    jax.config.update("jax_enable_preemption_service", False)  # it would take the signals that are meant to end the run
+    try:
+        jax.distributed.initialize(coordinator, num_hosts, host)
+    except (RuntimeError, ValueError) as error:
+        raise UserError(f"cannot join the other hosts ({one_line(error)}): give --coordinator HOST:PORT --num-hosts N --host I on each") from error
+    yield jax.process_index() == 0
+    jax.distributed.shutdown()  # waits for the others; so after a failure, which they must notice, it is left out
+
+
+def _fit(spec: RunSpec, configs: Sequence[TrainConfig], writers: Sequence[RunWriter]) -> Result:
+    """Trains all seeds of all configs at once, with a progress bar; each writer gets the runs of its config. Without writers, quietly."""
+    demonstrations = demonstrations_of(spec)
+    num_seeds = len(spec.seeds)
+    seeds = f"seed {spec.seeds[0]}" if num_seeds == 1 else f"{num_seeds} seeds from {spec.seeds[0]}"
+    settings = f", {len(configs)} settings" if len(configs) > 1 else ""
+    runs = dict(seeds=spec.seeds * len(configs), config=[config for config in configs for _ in spec.seeds])
+    if not writers:
+        return fit(spec.env, demonstrations * len(configs), **runs)
+    console.print(f"{spec.env.name}, {spec.config.algo}, {counted(demonstrations[0].lengths.shape[0], 'demonstration')}, {seeds}{settings}")
+
+    with progress_bars() as progress:
+        bar = add_bar(progress, spec.config)
+
+        def report(result: Result) -> None:
+            if not writers[0].started:
+                for writer in writers:
+                    writer.start()
+                progress.console.print(f"compiled in {result.compile_seconds:.1f} s{_on_devices(result)}")
+            elif not progress.tasks[bar].completed:
+                progress.console.print(f"first updates after {time.perf_counter() - STARTED:.1f} s")
+            new_rows = result.rows[len(configs) * writers[0].rows_written :]
+            for index, writer in enumerate(writers):
+                writer.report(result.rows_of(slice(index * num_seeds, (index + 1) * num_seeds)))
+            if new_rows:
+                progress.console.print(_evaluation_line(new_rows))
+            advance(progress, bar, result)
+
+        return fit(spec.env, demonstrations * len(configs), **runs, report=report)
+
+
+def _on_devices(result: Result) -> str:
+    used, available = len(result.state.env_steps.sharding.device_set), jax.device_count()
+    return "" if len(result.seeds) == 1 or available == 1 else f", on {used} of {available} devices"
+
+
+def _speed_line(summary: dict[str, Any]) -> str:
+    return (
+        f"{summary['updates_per_second']:,.0f} updates/s and {summary['env_steps_per_second']:,.0f} environment steps/s over all seeds, "
+        f"{summary['train_seconds']:.1f} s of training after {summary['compile_seconds']:.1f} s of compilation, "
+        f"peak memory {summary['peak_memory_bytes'] / 2**20:,.0f} MiB"
+    )
+
+
+def parse_train(arguments: list[str], options_class: type[TrainOptions] = TrainOptions, program: str = "hindrl train") -> tuple[RunSpec, Any]:
+    """Environment, algorithm and preset decide which flags there are and their defaults, so they are read first."""
+    chosen = {name: peek(arguments, name) for name in ("env", "algo", "preset", "config")}
+    if chosen["config"] is not None:
+        for name in ("env", "algo", "preset"):
+            if chosen[name] is not None:
+                raise UserError(f"--{name} and --config exclude each other: the configuration file says it; drop one of them")
+        spec = read_spec(Path(chosen["config"]))
+    else:
+        name = chosen["env"] or "FixedGridPickAndPlace"
+        config = preset(chosen["algo"] or "hindrl", chosen["preset"] or "default", env=name)
+        env_arguments = ORIGINAL_RULES[task(name).family] if chosen["preset"] == "original" else {}
+        spec = RunSpec(env=make(name, **env_arguments), config=config, demos="1", seeds=(0,))
+
+    environment_class = type(spec.env)
+    fields = [
+        ("env", Literal[tuple(TASKS)], spec.env.name, "The environment; `hindrl envs` lists them."),
+        ("preset", Preset, chosen["preset"] or "default", "Where the other defaults come from: our recipe, the thesis, or its original code."),
+        ("config", Path | None, None, "Run again what a config.json (or the directory of a run) says; other flags change it."),
+        ("options", options_class, options_class(demos=spec.demos), ""),
+        ("training", TrainConfig, spec.config, ""),
+        ("environment", environment_class, spec.env, ""),
+    ]
+    namespace = dataclasses.make_dataclass(
+        "Train",
+        [(name, Annotated[kind, tyro.conf.arg(help=text)] if text else kind, default) for name, kind, default, text in fields],
+        frozen=True,
+    )
+    parsed = parse(namespace, arguments, program, train.__doc__ if options_class is TrainOptions else sweep.__doc__)
+    check_trainable(parsed.environment)
+    options = parsed.options
+    seeds = spec.seeds
+    if options.seeds is not None or options.seed is not None:
+        count, first = (len(seeds) if options.seeds is None else options.seeds), (seeds[0] if options.seed is None else options.seed)
+        if count < 1:
+            raise UserError(f"--seeds {count} is too few: train at least 1 seed")
+        seeds = seeds_from(count, first)
+    demos = options.demos if _is_number(options.demos) or options.demos == FROM_PYTHON else str(Path(options.demos).absolute())
+    return RunSpec(env=parsed.environment, config=parsed.training, demos=demos, seeds=seeds), options
+
+
+def demonstrations_of(spec: RunSpec) -> list[Episodes]:
+    """One table of demonstrations per seed."""
+    if spec.demos == FROM_PYTHON:
+        raise UserError("the demonstrations of this run were given from Python, not from a file: name others with --demos")
+    if _is_number(spec.demos):
+        return [record_demonstrations(spec.env, int(spec.demos), seed=seed) for seed in spec.seeds]
+    episodes = load_demonstrations(spec.demos, spec.env)
+    solved = np.asarray(episodes.terminated)
+    if not solved.any():
+        raise UserError(f"{spec.demos}: none of its demonstrations solves the task, so there is no goal to learn: record others")
+    if not solved.all():
+        warnings.warn(f"{spec.demos}: dropped {(~solved).sum()} of {solved.size} demonstrations that do not solve the task", stacklevel=2)
+        episodes = jax.tree.map(lambda leaf: leaf[solved], episodes)
+    return [episodes] * len(spec.seeds)
+
+
+def _is_number(demos: str) -> bool:
+    return re.fullmatch(r"[+-]?\d+", demos) is not None
+
+
+def _evaluation_line(rows: Sequence[Any]) -> str:
+    success = [row.success for row in rows]
+    spread = f" (worst {min(success):4.0%})" if len(rows) > 1 else ""
+    return (
+        f"{rows[0].env_steps:9,d} steps {rows[0].updates:8,d} updates {rows[0].seconds:7.1f} s   "
+        f"success {np.mean(success):4.0%}{spread}   length {np.mean([row.episode_length for row in rows]):5.1f}"
+    )
+
+
+def _summary_table(summary: dict[str, Any]) -> Table:
+    table = Table("seed", "final", "best", "length", "95% after", "updates", "seconds", box=box.SIMPLE_HEAD)
+    for column in table.columns:
+        column.justify = "right"
+    for seed in summary["seeds"]:
+        reached = seed["env_steps_to_95"] is not None
+        table.add_row(
+            str(seed["seed"]),
+            f"{seed['final_success']:.0%}",
+            f"{seed['best_success']:.0%}",
+            f"{seed['episode_length']:.1f}",
+            f"{seed['env_steps_to_95']:,} steps" if reached else "never",
+            f"{seed['updates_to_95']:,}" if reached else "",
+            f"{seed['seconds_to_95']:.1f}" if reached else "",
+        )
+    return table
