@@ -21,6 +21,7 @@ STARTED = time.perf_counter()  # this package loads before the large ones it use
 
 # Loaded on first use: `envs` and `experts` import the core below this package, and the names here import `envs` and `experts`.
 _EXPORTS = {
+    "Checkpoints": "hindrl_jax.checkpoints",
     "Result": "hindrl_jax.experiment",
     "UserError": "hindrl_jax.errors",
     "fit": "hindrl_jax.experiment",

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+import psutil
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
@@ -60,3 +62,28 @@ def spread(tree: Any, mesh: Mesh) -> Any:
 def gather(tree: Any) -> Any:
     """Numpy arrays (S, ...) of all seeds, on every host."""
     return jax.device_get(tree) if jax.process_count() == 1 else multihost_utils.process_allgather(tree, tiled=True)
+
+
+def tree_bytes(tree: Any) -> int:
+    """What the arrays of a tree, or their shapes, take in memory."""
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
+
+
+def free_memory(mesh: Mesh) -> int | None:
+    """Bytes that the mesh's devices of this host have free, all together; None where they do not say."""
+    devices = [device for device in mesh.devices.flat if device.process_index == jax.process_index()]
+    if devices[0].platform == "cpu":
+        return _free_host_memory()
+    stats = [device.memory_stats() for device in devices]
+    return sum(s["bytes_limit"] - s["bytes_in_use"] for s in stats) if all(s and "bytes_limit" in s for s in stats) else None
+
+
+def _free_host_memory() -> int:
+    """What the machine has free, and no more than the control group of this process, a container for one, may still take (Linux)."""
+    free, group = psutil.virtual_memory().available, Path("/sys/fs/cgroup")
+    try:
+        limit, used = int((group / "memory.max").read_text()), int((group / "memory.current").read_text())
+        kept_files = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())["inactive_file"]
+        return min(free, limit - used + int(kept_files))
+    except (OSError, ValueError, KeyError):  # no such group, or no limit, which is the word max
+        return free

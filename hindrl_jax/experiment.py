@@ -11,12 +11,13 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
 from experts.recording import on_host, record
 from hindrl_jax import train as training
 from hindrl_jax.agent import Metrics
 from hindrl_jax.config import SWEEPABLE, TrainConfig, sweepable_value, with_traced_values
-from hindrl_jax.devices import gather, over_seeds, seed_mesh, shapes_on, spread
+from hindrl_jax.devices import free_memory, gather, over_seeds, seed_mesh, shapes_on, spread, tree_bytes
 from hindrl_jax.errors import UserError
 from hindrl_jax.registry import task
 from hindrl_jax.rollout import Evaluation
@@ -27,6 +28,10 @@ SOLVED = 0.95
 FRESH_EPISODES = 100
 CHUNKS_PER_EVALUATION = 10
 _RUN_ONCE = {"xla_backend_optimization_level": 0}  # for programs whose compilation takes longer than their one run
+
+
+class Diverged(UserError):
+    """A loss or a value is not a finite number."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,6 +94,10 @@ class Result:
     """(S,) share of 100 fresh episodes that the final policies solve; None while the run is under way."""
     final_length: np.ndarray | None = None
     """(S,) mean length of those episodes."""
+    key: Array | None = None
+    """(S,) keys of the evaluations to come."""
+    chunks: list[dict[str, np.ndarray]] = dataclasses.field(default_factory=list)
+    """Metrics, leaves (S,), of the chunks since the last evaluation."""
 
     @property
     def config(self) -> TrainConfig:
@@ -186,6 +195,7 @@ def fit(
     *,
     seeds: Sequence[int] = (0,),
     report: Callable[[Result], None] = lambda result: None,
+    restore: Callable[[Result], Result | None] = lambda begun: None,
 ) -> Result:
     """Trains one policy per seed, all of them side by side in one compiled program.
 
@@ -198,12 +208,17 @@ def fit(
       config: for example from `preset`; one for all seeds, or one per seed. They may differ in the fields of `config.SWEEPABLE`.
       seeds: non-negative integers. A seed gives the same run whatever the others are, up to floating-point rounding.
       report: called after compilation, several times between evaluations, after each evaluation, and at the end.
+      restore: called before anything is computed with a result whose guidance, state and key are `jax.ShapeDtypeStruct`s. Where it returns
+        what `report` was given at some time in an earlier call with the same arguments, the experiment goes on from there, and all that
+        follows is the same, bit for bit; see `hindrl_jax.checkpoints`. Where it returns None, the experiment begins.
 
     Returns:
       The finished experiment. With several hosts, its agents are gathered on each of them, and the replay is not.
 
     Raises:
-      UserError: if the config does not fit the environment, or the environment cannot be trained in.
+      UserError: if the config does not fit the environment, or the environment cannot be trained in, or the experiment does not fit into the
+        memory.
+      Diverged: if a loss or a value is not a finite number.
     """
     check_trainable(env)
     if not seeds or not all(0 <= seed < 2**32 for seed in seeds):
@@ -219,48 +234,72 @@ def fit(
 
     started = time.perf_counter()
     programs = _Programs(env, configs, tables)
+    result = Result(env=env, configs=configs, seeds=tuple(seeds), **programs.shapes, rows=[], compile_seconds=0.0)
+    restored = restore(result)
     seeds_on_devices, tables, values = spread((np.asarray(seeds, np.uint32), tables, programs.values), programs.mesh)
-    guidance, state, key = jax.block_until_ready(programs.start(seeds_on_devices, tables, values))
-    compile_seconds = time.perf_counter() - started
-    result = Result(env=env, configs=configs, seeds=tuple(seeds), guidance=guidance, state=state, rows=[], compile_seconds=compile_seconds)
+    if restored is None:
+        result.guidance, result.state, result.key = jax.block_until_ready(programs.start(seeds_on_devices, tables, values))
+    else:
+        result = restored
+    result.compile_seconds = time.perf_counter() - started
     report(result)
 
-    started = time.perf_counter()
-    if config.algo != "bc":
-        result.state = jax.block_until_ready(programs.collect(result.state, guidance, values))
-        result.env_steps = programs.warm_up * config.num_envs
+    started = time.perf_counter() - result.train_seconds
+    if restored is None and config.algo != "bc":
+        result.state = jax.block_until_ready(programs.collect(result.state, result.guidance, values))
+        result.env_steps = programs.steps_at_random
         if programs.pretrain is not None:
-            result.state = jax.block_until_ready(programs.pretrain(result.state, guidance, values))
+            result.state = jax.block_until_ready(programs.pretrain(result.state, result.guidance, values))
             result.updates = config.bc_warm_start + config.pretrain_updates
-    chunks_metrics: list[dict[str, np.ndarray]] = []
-    next_evaluation = result.steps_done + config.eval_every
     while result.steps_done < config.steps:
-        result.state, metrics = programs.learn(result.state, guidance, values)
-        chunks_metrics.append(gather(metrics))
+        result.state, metrics = programs.learn(result.state, result.guidance, values)
+        result.chunks.append(gather(metrics))
         if config.algo == "bc":
             result.updates += programs.chunk
         else:
             result.env_steps += programs.chunk * config.num_envs
             result.updates += programs.chunk * config.updates_per_iteration
-        if result.steps_done >= min(next_evaluation, config.steps):
-            key, evaluation = programs.evaluate(key, result.state.agent.average_actor, guidance, values)
+        _check_finite(result)
+        evaluations_done = len(result.rows) // len(seeds)
+        if result.steps_done >= min(programs.steps_at_random + (evaluations_done + 1) * config.eval_every, config.steps):
+            result.key, evaluation = programs.evaluate(result.key, result.state.agent.average_actor, result.guidance, values)
             evaluation = gather(evaluation)
             result.train_seconds = time.perf_counter() - started
-            averaged = {name: np.mean([chunk[name] for chunk in chunks_metrics], axis=0) for name in chunks_metrics[0]}
+            averaged = {name: np.mean([chunk[name] for chunk in result.chunks], axis=0) for name in result.chunks[0]}
             result.rows += _rows(result, evaluation, averaged)
-            chunks_metrics.clear()
-            next_evaluation += config.eval_every
+            result.chunks.clear()
         result.train_seconds = time.perf_counter() - started
         report(result)
 
-    _, fresh = programs.evaluate_fresh(key, result.state.agent.average_actor, guidance, values)
+    _, fresh = programs.evaluate_fresh(result.key, result.state.agent.average_actor, result.guidance, values)
     fresh = gather(fresh)
     result.final_success, result.final_length = fresh.success.mean(axis=1), fresh.length.mean(axis=1)
     if jax.process_count() > 1:
-        result.guidance, agent = gather((guidance, result.state.agent))
+        result.guidance, agent = gather((result.guidance, result.state.agent))
         result.state = result.state.replace(agent=agent)
     report(result)
     return result
+
+
+def _check_fits_into_memory(state: TrainState, num_seeds: int, mesh: Mesh) -> None:
+    """Compares the size of the state, nearly all of it replay, with the memory there is, before any of it is taken."""
+    needed, free = tree_bytes(state) / jax.process_count(), free_memory(mesh)
+    if free is not None and needed > free:
+        raise UserError(
+            f"{num_seeds} runs side by side take {needed / 2**30:,.1f} GiB of memory, {tree_bytes(state.replay) / tree_bytes(state):.0%} of it "
+            f"for the replay, and {free / 2**30:,.1f} GiB are free: lower buffer_size or the number of seeds"
+        )
+
+
+def _check_finite(result: Result) -> None:
+    """Ends an experiment that cannot be rescued: a number that is not finite spreads to all parameters within a few gradient steps."""
+    for name, values in result.chunks[-1].items():
+        if not np.isfinite(values).all():
+            index = int(np.argmin(np.isfinite(values)))
+            raise Diverged(
+                f"{name} of seed {result.seeds[index]} is {values[index]} after {result.env_steps} environment steps and {result.updates} updates: "
+                "try a lower learning_rate, max_gradient_norm = 1, or layer_norm"
+            )
 
 
 def _one_for_each(seeds: Sequence[int], given: Any, kind: type[Any], noun: str) -> tuple[Any, ...]:
@@ -313,6 +352,7 @@ class _Programs:
         config = configs[0]
         cloning = config.algo == "bc"
         self.warm_up, per_iteration = (0, 1) if cloning else (training.warm_up_iterations(env, config), config.num_envs)
+        self.steps_at_random = self.warm_up * config.num_envs
         to_learn = steps_to_learn(env, config)
         self.chunk = max(1, min(config.eval_every // CHUNKS_PER_EVALUATION, to_learn) // per_iteration)
         self.values = {name: np.asarray([sweepable_value(c, name) for c in configs], np.float32) for name in _swept_fields(configs)}
@@ -352,6 +392,8 @@ class _Programs:
             seeds = jax.ShapeDtypeStruct((len(configs),), np.uint32)
             traced = program(start).trace(*shapes_on((seeds, demonstrations), self.mesh), values)
             guidance, state, key = shapes_on(traced.out_info, self.mesh)
+            self.shapes = {"guidance": guidance, "state": state, "key": key}
+            _check_fits_into_memory(state, len(configs), self.mesh)
             actor = state.agent.average_actor
             learning = compiled(program(learn, donate=True).trace(state, guidance, values))
             starting = compiled(traced, _RUN_ONCE)

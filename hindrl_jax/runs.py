@@ -5,6 +5,7 @@ metrics.csv       a row per evaluation and seed, written as the run goes
 summary.json      the outcome per seed and the totals
 parameters.npz    networks and behavioural goals, leading axis the seeds; no pickle
 curve.png, episode.gif
+checkpoint/       while it is under way, or if it was stopped: what it needs to go on
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import json
 import os
 import re
 import resource
+import shutil
 import sys
 import warnings
 import zipfile
@@ -23,6 +25,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
+import filelock
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -42,6 +45,7 @@ from hindrl_jax.types import RestorableEnvironment, action_to_env, compiler_opti
 
 CONFIG, METRICS, SUMMARY, PARAMETERS = "config.json", "metrics.csv", "summary.json", "parameters.npz"
 CURVE, EPISODE = "curve.png", "episode.gif"
+CHECKPOINTS, LOCK = "checkpoint", ".lock"
 SWEEP, SWEEP_CURVES = "sweep.csv", "sweep.png"
 FROM_PYTHON = "given from Python"
 _FILES = (CONFIG, METRICS, SUMMARY, PARAMETERS, CURVE, EPISODE)
@@ -142,34 +146,55 @@ def _refuse_unknown(data: dict[str, Any], known: Any, where: Path) -> None:
 class RunWriter:
     """Writes a run's directory, file by file, as the run goes. Use `save_run` for a run that is already finished."""
 
-    def __init__(self, path: Path, spec: RunSpec, *, overwrite: bool):
+    def __init__(self, path: Path, spec: RunSpec, *, overwrite: bool = False, resume: bool = False):
         """Only checks; nothing is written or removed before `start`.
 
+        Args:
+          path: the directory.
+          spec: what the run is asked to do.
+          overwrite: replace a run that is there.
+          resume: go on with the run that is there; its checkpoints are kept.
+
         Raises:
-          UserError: if the path is a file, cannot be written, or holds (part of) a run and `overwrite` is off.
+          UserError: if the path is a file, cannot be written, is written by another process, or holds (part of) a run and neither
+            `overwrite` nor `resume` is on.
         """
-        self.path, self.spec = path, spec
+        self.path, self.spec, self.resume = path, spec, resume
+        self._lock = filelock.FileLock(path / LOCK, timeout=0)
         if path.exists() and not path.is_dir():
             raise UserError(f"{path} is a file: choose another --out")
-        there = [name for name in _FILES if (path / name).exists()]
-        if there and not overwrite:
+        there = [name for name in (*_FILES, CHECKPOINTS) if (path / name).exists()]
+        if there and not (overwrite or resume):
             raise UserError(f"{path} already holds a run ({', '.join(there)}): choose another --out, or replace it with --overwrite")
         reason = why_unwritable(path)
         if reason:
             raise UserError(f"cannot write {path} ({reason}): choose another --out")
+        if (path / LOCK).exists():
+            self._take_lock()
+            self._lock.release()
         self.rows_written = 0
         self.started = False
 
+    def _take_lock(self) -> None:
+        """Keeps other processes out until `finish`, or until this one ends, however it ends."""
+        try:
+            self._lock.acquire()
+        except filelock.Timeout:
+            raise UserError(f"another process is writing {self.path}: wait for it, stop it, or choose another --out") from None
+
     def start(self) -> None:
-        """Removes what an earlier run left, then writes the configuration.
+        """Removes what an earlier run left, or what this one left after its last checkpoint, then writes the configuration.
 
         Raises:
-          UserError: if the directory cannot be written.
+          UserError: if the directory cannot be written, or another process writes it.
         """
         with disk_trouble(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
+            self._take_lock()
             for name in _FILES:
                 (self.path / name).unlink(missing_ok=True)
+            if not self.resume:
+                shutil.rmtree(self.path / CHECKPOINTS, ignore_errors=True)
             _write_atomically(self.path / CONFIG, json.dumps(self.spec.to_json(), indent=2) + "\n")
         self.started = True
 
@@ -204,6 +229,9 @@ class RunWriter:
                 load_run(self.path).render(self.path / EPISODE)
             except UserError as error:
                 warnings.warn(f"no {EPISODE}: {error}", stacklevel=2)
+        shutil.rmtree(self.path / CHECKPOINTS, ignore_errors=True)  # last, so that a process killed on the way here can be resumed
+        (self.path / LOCK).unlink(missing_ok=True)
+        self._lock.release()
         return summary
 
     def files(self) -> list[str]:
@@ -456,7 +484,7 @@ def load_run(path: str | os.PathLike[str]) -> Run:
     spec = read_spec(path)
     file = path / PARAMETERS
     if not file.exists():
-        raise UserError(f"{path} holds no {PARAMETERS}: the run did not finish; start it again with `hindrl train --config {path / CONFIG}`")
+        raise UserError(f"{path} holds no {PARAMETERS}: the run did not finish; go on with it by `hindrl train --resume {path}`")
     try:
         with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             tree = unflatten_dict({name: jnp.asarray(archive[name]) for name in archive.files}, sep="/")

@@ -5,7 +5,10 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
+import math
 import re
+import signal
+import sys
 import time
 import warnings
 from collections.abc import Iterator, Sequence
@@ -19,15 +22,16 @@ from rich import box
 from rich.table import Table
 
 from hindrl_jax import STARTED
+from hindrl_jax.checkpoints import Checkpoints
 from hindrl_jax.cli.common import console, counted, parse, peek, seeds_from
 from hindrl_jax.cli.progress import add_bar, advance, progress_bars
 from hindrl_jax.config import SWEEPABLE, TrainConfig, without_effect
 from hindrl_jax.datasets import load_demonstrations
 from hindrl_jax.errors import UserError, one_line
-from hindrl_jax.experiment import Result, check_trainable, fit, record_demonstrations
+from hindrl_jax.experiment import Diverged, Result, check_trainable, fit, record_demonstrations
 from hindrl_jax.presets import ORIGINAL_RULES, Preset, preset
 from hindrl_jax.registry import TASKS, checked, did_you_mean, make, task
-from hindrl_jax.runs import FROM_PYTHON, RunSpec, RunWriter, SweepWriter, read_spec, summarise
+from hindrl_jax.runs import CHECKPOINTS, FROM_PYTHON, SUMMARY, RunSpec, RunWriter, SweepWriter, read_spec, summarise
 from hindrl_jax.types import Episodes
 
 
@@ -45,6 +49,9 @@ class TrainOptions:
     """Directory of the run (default: runs/ENV_ALGO_TIME, for a sweep runs/ENV_ALGO_sweep_TIME)."""
     overwrite: bool = False
     """Replace a run that is already there."""
+    checkpoint_every: float = 60.0
+    """Seconds between two checkpoints, which are also written at Ctrl-C and SIGTERM, and removed at the end; 0 writes none. Not with several
+    hosts, nor by `hindrl sweep`."""
     distributed: bool = False
     """Share the seeds with other hosts: start the same command on each of them. The first one writes. Clusters that JAX knows (SLURM, Open
     MPI, Kubernetes, TPU) need nothing else; others need the three options below."""
@@ -65,13 +72,33 @@ class SweepOptions(TrainOptions):
     side in one compiled program. The field is one that only enters arithmetic: learning_rate, bc_weight, gamma, ..."""
 
 
+@dataclasses.dataclass(frozen=True)
+class ResumeOptions:
+    """Options of `hindrl train --resume`."""
+
+    resume: Path
+    """Directory of the run."""
+    checkpoint_every: float = TrainOptions.checkpoint_every
+    """Seconds between two checkpoints; 0 writes none."""
+
+
 def train(arguments: list[str]) -> None:
     """Train policies from demonstrations."""
-    spec, options = parse_train(arguments)
-    out = options.out or _default_out(spec)
-    writer = RunWriter(out, spec, overwrite=options.overwrite)
-    with _hosts(options) as writes:
-        result = _fit(spec, [spec.config], [writer] if writes else [])
+    resumed = peek(arguments, "resume") is not None
+    if resumed:
+        options = parse(ResumeOptions, arguments, "hindrl train --resume DIRECTORY", "Go on with a run that was stopped or killed.")
+        spec, out = read_spec(options.resume), options.resume
+        if (out / SUMMARY).exists():
+            raise UserError(f"{out} is finished, so there is nothing to resume: look at it with `hindrl eval {out}`")
+    else:
+        spec, options = parse_train(arguments)
+        out = options.out or _default_out(spec)
+    writer = RunWriter(out, spec, overwrite=not resumed and options.overwrite, resume=resumed)
+    if not options.checkpoint_every >= 0:
+        raise UserError(f"--checkpoint-every {options.checkpoint_every} is not usable: give a number of seconds, or 0 for no checkpoints")
+    checkpoints = Checkpoints(out / CHECKPOINTS, seconds=options.checkpoint_every or math.inf) if options.checkpoint_every or resumed else None
+    with contextlib.nullcontext(True) if resumed else _hosts(options) as writes:
+        result = _fit(spec, [spec.config], [writer] if writes else [], None if jax.process_count() > 1 else checkpoints)
         if writes:
             summary = writer.finish(result)
             console.print(_summary_table(summary))
@@ -162,9 +189,10 @@ def _hosts(options: TrainOptions) -> Iterator[bool]:
     jax.distributed.shutdown()  # waits for the others; so after a failure, which they must notice, it is left out
 
 
-def _fit(spec: RunSpec, configs: Sequence[TrainConfig], writers: Sequence[RunWriter]) -> Result:
+def _fit(spec: RunSpec, configs: Sequence[TrainConfig], writers: Sequence[RunWriter], checkpoints: Checkpoints | None = None) -> Result:
     """Trains all seeds of all configs at once, with a progress bar; each writer gets the runs of its config. Without writers, quietly."""
-    demonstrations = demonstrations_of(spec)
+    resumes = bool(writers) and writers[0].resume
+    demonstrations = checkpoints.load_demonstrations() if resumes and checkpoints.has_demonstrations else demonstrations_of(spec)
     num_seeds = len(spec.seeds)
     seeds = f"seed {spec.seeds[0]}" if num_seeds == 1 else f"{num_seeds} seeds from {spec.seeds[0]}"
     settings = f", {len(configs)} settings" if len(configs) > 1 else ""
@@ -173,24 +201,83 @@ def _fit(spec: RunSpec, configs: Sequence[TrainConfig], writers: Sequence[RunWri
         return fit(spec.env, demonstrations * len(configs), **runs)
     console.print(f"{spec.env.name}, {spec.config.algo}, {counted(demonstrations[0].lengths.shape[0], 'demonstration')}, {seeds}{settings}")
 
-    with progress_bars() as progress:
+    with progress_bars() as progress, _StopSignals() as stop_signals:
         bar = add_bar(progress, spec.config)
+        began_at = 0
+
+        def begin(result: Result) -> None:
+            nonlocal began_at
+            for writer in writers:
+                writer.start()
+            if checkpoints is not None:
+                checkpoints.save_demonstrations(demonstrations)
+            began_at = result.steps_done
+            progress.console.print(f"compiled in {result.compile_seconds:.1f} s{_on_devices(result)}")
+            if resumes:
+                progress.console.print(f"going on at step {began_at:,}" if began_at else "there is no checkpoint yet: beginning again")
+            stop_signals.note()
 
         def report(result: Result) -> None:
+            rows_shown = len(configs) * writers[0].rows_written
             if not writers[0].started:
-                for writer in writers:
-                    writer.start()
-                progress.console.print(f"compiled in {result.compile_seconds:.1f} s{_on_devices(result)}")
-            elif not progress.tasks[bar].completed:
+                begin(result)
+                rows_shown = len(result.rows)
+            elif progress.tasks[bar].completed == began_at:
                 progress.console.print(f"first updates after {time.perf_counter() - STARTED:.1f} s")
-            new_rows = result.rows[len(configs) * writers[0].rows_written :]
             for index, writer in enumerate(writers):
                 writer.report(result.rows_of(slice(index * num_seeds, (index + 1) * num_seeds)))
-            if new_rows:
-                progress.console.print(_evaluation_line(new_rows))
+            if result.rows[rows_shown:]:
+                progress.console.print(_evaluation_line(result.rows[rows_shown:]))
             advance(progress, bar, result)
+            if checkpoints is not None:
+                checkpoints.save_when_due(result)
+            if stop_signals.received is not None and result.final_success is None:
+                _stop(result, stop_signals.received, writers[0].path, checkpoints)
 
-        return fit(spec.env, demonstrations * len(configs), **runs, report=report)
+        restore = {} if checkpoints is None else {"restore": checkpoints.restore}
+        try:
+            return fit(spec.env, demonstrations * len(configs), **runs, report=report, **restore)
+        except Diverged as error:
+            if checkpoints is None or checkpoints.steps is None:
+                raise
+            raise UserError(f"{error}; the last good checkpoint, of step {checkpoints.steps}, is in {checkpoints.folder}") from error
+
+
+class _StopSignals:
+    """Notes the first SIGINT (Ctrl-C) or SIGTERM, so that the run can end at a place where it can be resumed; the second one ends it at once."""
+
+    def __init__(self) -> None:
+        self.received: int | None = None
+        self._before: dict[int, Any] = {}
+
+    def note(self) -> None:
+        """From now on; until then, signals do what they always do."""
+        self._before = {number: signal.signal(number, self._receive) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def _receive(self, number: int, frame: Any) -> None:
+        self.received = number
+        self._put_back()
+
+    def _put_back(self) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def __enter__(self) -> _StopSignals:
+        return self
+
+    def __exit__(self, *exception: Any) -> None:
+        self._put_back()
+
+
+def _stop(result: Result, number: int, out: Path, checkpoints: Checkpoints | None) -> None:
+    """Ends the process as the signal asks, with a checkpoint."""
+    if checkpoints is None:
+        said = "no checkpoint was asked for"
+    else:
+        checkpoints.save(result)
+        said = f"go on with `hindrl train --resume {out}`"
+    print(f"hindrl: stopped after {result.steps_done:,} of {result.config.steps:,} steps; {said}", file=sys.stderr)
+    sys.exit(128 + number)
 
 
 def _on_devices(result: Result) -> str:
@@ -204,6 +291,9 @@ def _speed_line(summary: dict[str, Any]) -> str:
         f"{summary['train_seconds']:.1f} s of training after {summary['compile_seconds']:.1f} s of compilation, "
         f"peak memory {summary['peak_memory_bytes'] / 2**20:,.0f} MiB"
     )
+
+
+_RESUME = "Go on with the run of a directory that was stopped or killed, as if it had never been; needs no other option."
 
 
 def parse_train(arguments: list[str], options_class: type[TrainOptions] = TrainOptions, program: str = "hindrl train") -> tuple[RunSpec, Any]:
@@ -225,6 +315,7 @@ def parse_train(arguments: list[str], options_class: type[TrainOptions] = TrainO
         ("env", Literal[tuple(TASKS)], spec.env.name, "The environment; `hindrl envs` lists them."),
         ("preset", Preset, chosen["preset"] or "default", "Where the other defaults come from: our recipe, the thesis, or its original code."),
         ("config", Path | None, None, "Run again what a config.json (or the directory of a run) says; other flags change it."),
+        *([("resume", Path | None, None, _RESUME)] if options_class is TrainOptions else []),
         ("options", options_class, options_class(demos=spec.demos), ""),
         ("training", TrainConfig, spec.config, ""),
         ("environment", environment_class, spec.env, ""),
