@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 from hindrl_jax.checks import check, check_types
@@ -372,21 +372,71 @@ def sweepable_value(config: TrainConfig, name: str) -> float | None:
     return getattr(getattr(config, SWEEPABLE[name]), name)
 
 
+def _relabels(config: TrainConfig) -> bool:
+    return config.algo not in ("bc", "tqcfd") and config.batch.num_sampled_goals > 0
+
+
+def _has_demo_rows(config: TrainConfig) -> bool:
+    return config.algo == "bc" or config.batch.max_demo_rows > 0 or config.batch.has_priorities
+
+
+# Which fields have an effect only under a condition: the fields, the condition, and what to do where it does not hold.
+_CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
+    (
+        "max_demo_ratio reach_zero num_sampled_goals hindrl_sampling_strategy union_sampling_ratio intersection_goals strategy_mixture n_step gamma "
+        "demo_returns terminate_on_relabel bound_by_obtained_return timeouts_are_terminal importance_exponent demo_priority_bonus "
+        "achieved_goal_ratio final_achieved_goal_ratio clip_targets num_critics num_target_critics num_quantiles top_quantiles_to_drop_per_net "
+        "layer_norm target_update_rate initial_alpha target_entropy final_target_entropy actor_delay exploration_noise target_noise "
+        "target_noise_clip normalise_value bc_weight final_bc_weight num_envs updates_per_iteration learning_starts buffer_size demo_reset_ratio "
+        "demo_reset_curriculum",
+        lambda config: config.algo != "bc",
+        "behaviour cloning does not use it: choose another algo",
+    ),
+    (
+        "initial_alpha target_entropy final_target_entropy",
+        lambda c: c.agent.has_entropy,
+        "{base} has no entropy coefficient: choose --base tqc or sac",
+    ),
+    ("num_quantiles top_quantiles_to_drop_per_net", lambda c: c.agent.base == "tqc", "{base} has no quantiles: choose --base tqc"),
+    ("exploration_noise", lambda c: not c.agent.has_entropy, "{base} samples its actions: choose --base td3 or ddpg"),
+    ("target_noise target_noise_clip", lambda c: c.agent.base == "td3", "{base} has no such noise: choose --base td3"),
+    (
+        "hindrl_sampling_strategy union_sampling_ratio intersection_goals strategy_mixture terminate_on_relabel",
+        _relabels,
+        "nothing is relabelled: choose --algo hindrl with --num-sampled-goals above 0",
+    ),
+    (
+        "union_sampling_ratio",
+        lambda c: c.batch.hindrl_sampling_strategy == "joint_union",
+        "only relabelling by joint_union uses it: choose --hindrl-sampling-strategy joint_union",
+    ),
+    (
+        "intersection_goals",
+        lambda c: "joint_intersection" in dict(c.batch.sources),
+        "only relabelling by joint_intersection uses it: choose --hindrl-sampling-strategy joint_intersection",
+    ),
+    ("importance_exponent demo_priority_bonus", lambda c: c.batch.has_priorities, "transitions have no priorities: raise --priority-exponent"),
+    ("reach_zero", lambda c: c.batch.max_demo_rows > 0, "the batch has no demonstration rows: raise --max-demo-ratio"),
+    (
+        "bc_weight final_bc_weight bc_loss bc_action q_filter demo_returns",
+        _has_demo_rows,
+        "the batch has no demonstration rows to clone: raise --max-demo-ratio",
+    ),
+    ("q_filter bc_loss bc_action", lambda c: c.algo == "bc" or c.agent.bc_weight > 0.0, "nothing is cloned: raise --bc-weight"),
+    ("k", lambda c: c.goal.m > 0, "epsilon depends on it only for m > 0: add --m 5"),
+    (
+        "m k",
+        lambda c: _relabels(c) or c.goal.epsilon_filtering or c.goal.has_achieved_goals,
+        "epsilon is used only for relabelling, achieved goals and the filter: choose --algo hindrl",
+    ),
+)
+
+
 def without_effect(config: TrainConfig, name: str) -> str | None:
-    """Why changing a field of `SWEEPABLE` would change nothing in this config, and what to do; None if it does have an effect."""
-    if config.algo == "bc" and name not in ("learning_rate", "final_learning_rate", "actor_average_rate", "actor_average_span"):
-        return "behaviour cloning does not use it: choose another algo"
-    if name in ("initial_alpha", "target_entropy", "final_target_entropy") and not config.agent.has_entropy:
-        return f"{config.agent.base} has no entropy coefficient: choose --base tqc or sac"
-    relabelled = config.batch.num_sampled_goals > 0
-    if name == "union_sampling_ratio" and not (relabelled and config.batch.hindrl_sampling_strategy == "joint_union"):
-        return "only relabelling by joint_union uses it: choose --hindrl-sampling-strategy joint_union"
-    if name == "k" and config.goal.m == 0:
-        return "epsilon depends on it only for m > 0: add --m 5"
-    if name == "k" and not (relabelled or config.goal.epsilon_filtering or config.goal.has_achieved_goals):
-        return "epsilon is used only for relabelling, achieved goals and the filter: choose --algo hindrl"
-    if name in ("bc_weight", "final_bc_weight") and config.batch.max_demo_rows == 0 and not config.batch.has_priorities:
-        return "the batch has no demonstration rows to clone: raise --max-demo-ratio"
+    """Why changing a field would change nothing in this config, and what to do; None if it has an effect, as far as is known."""
+    for names, has_effect, reason in _CONDITIONS:
+        if name in names.split() and not has_effect(config):
+            return reason.format(base=config.agent.base)
     return None
 
 

@@ -9,6 +9,7 @@ import re
 import shlex
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import h5py
@@ -57,6 +58,14 @@ def refusal(capsys, *arguments) -> str:
     assert printed.err.count("\n") == 1, printed.err
     assert "Traceback" not in printed.err
     return printed.err
+
+
+def test_options_that_change_nothing_are_warned_about():
+    with pytest.warns(UserWarning, match="num_quantiles = 50 changes nothing: sac has no quantiles"):
+        training.parse_train(["--base", "sac", "--num-quantiles", "50"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        training.parse_train(["--base", "sac", "--num-critics", "3"])
 
 
 def test_run_directory_holds_what_it_promises(run):

@@ -7,10 +7,11 @@ from pathlib import Path
 import pytest
 
 import hindrl_jax
+from hindrl_jax import config
 from hindrl_jax.config import AgentConfig, BatchConfig, GoalConfig, TrainConfig
 
 SOURCES = [path for path in Path(hindrl_jax.__file__).parent.rglob("*.py") if path.name != "config.py"]
-FIELDS = [(config, field.name) for config in (BatchConfig, GoalConfig, AgentConfig, TrainConfig) for field in dataclasses.fields(config)]
+FIELDS = [(part, field.name) for part in (BatchConfig, GoalConfig, AgentConfig, TrainConfig) for field in dataclasses.fields(part)]
 # Derived in config.py itself and read elsewhere under another name.
 READ_THROUGH = {
     "max_demo_ratio": "max_demo_rows",
@@ -202,3 +203,33 @@ def test_rollout_conditioned_is_the_name_of_the_thesis_for_future():
 @pytest.mark.parametrize(("size", "ratio", "rows"), [(4096, 0.1, 409), (12_000, 0.1, 1200), (10, 0.0, 0), (3, 0.3, 0), (3, 0.34, 1)])
 def test_number_of_demonstration_rows(size, ratio, rows):
     assert BatchConfig(batch_size=size, max_demo_ratio=ratio).max_demo_rows == rows
+
+
+def test_conditions_are_about_fields_that_exist():
+    known = {field.name for part in (TrainConfig, BatchConfig, GoalConfig, AgentConfig) for field in dataclasses.fields(part)}
+    assert {name for names, _, _ in config._CONDITIONS for name in names.split()} <= known
+
+
+@pytest.mark.parametrize(
+    ("changes", "name", "reason"),
+    [
+        ({}, "num_quantiles", None),
+        ({"agent": {"base": "sac"}}, "num_quantiles", "sac has no quantiles"),
+        ({"agent": {"base": "td3"}}, "target_entropy", "td3 has no entropy coefficient"),
+        ({}, "exploration_noise", "tqc samples its actions"),
+        ({"agent": {"base": "td3"}}, "exploration_noise", None),
+        ({}, "union_sampling_ratio", "only relabelling by joint_union"),
+        ({"batch": {"hindrl_sampling_strategy": "joint_union"}}, "union_sampling_ratio", None),
+        ({"batch": {"num_sampled_goals": 0.0}}, "hindrl_sampling_strategy", "nothing is relabelled"),
+        ({"batch": {"max_demo_ratio": 0.0}}, "bc_loss", "no demonstration rows to clone"),
+        ({"batch": {"max_demo_ratio": 0.0, "priority_exponent": 0.5}}, "bc_loss", None),
+        ({"agent": {"bc_weight": 0.0}}, "bc_action", "nothing is cloned"),
+        ({}, "learning_rate", None),
+        ({"algo": "bc"}, "learning_rate", None),
+        ({"algo": "bc"}, "num_critics", "behaviour cloning does not use it"),
+    ],
+)
+def test_fields_without_effect_are_known(changes, name, reason):
+    parts = {part: dataclasses.replace(getattr(TrainConfig(), part), **values) for part, values in changes.items() if part != "algo"}
+    said = config.without_effect(TrainConfig(**parts, **{key: value for key, value in changes.items() if key == "algo"}), name)
+    assert said is None if reason is None else reason in said

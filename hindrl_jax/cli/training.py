@@ -327,6 +327,7 @@ def parse_train(arguments: list[str], options_class: type[TrainOptions] = TrainO
     )
     parsed = parse(namespace, arguments, program, train.__doc__ if options_class is TrainOptions else sweep.__doc__)
     check_trainable(parsed.environment)
+    _warn_of_what_has_no_effect(spec.config, parsed.training)
     options = parsed.options
     seeds = spec.seeds
     if options.seeds is not None or options.seed is not None:
@@ -336,6 +337,16 @@ def parse_train(arguments: list[str], options_class: type[TrainOptions] = TrainO
         seeds = seeds_from(count, first)
     demos = options.demos if _is_number(options.demos) or options.demos == FROM_PYTHON else str(Path(options.demos).absolute())
     return RunSpec(env=parsed.environment, config=parsed.training, demos=demos, seeds=seeds), options
+
+
+def _warn_of_what_has_no_effect(before: TrainConfig, config: TrainConfig) -> None:
+    """About the fields that the user has changed, and which nothing will read."""
+    for section_before, section in ((before, config), (before.batch, config.batch), (before.goal, config.goal), (before.agent, config.agent)):
+        for field in dataclasses.fields(section):
+            value = getattr(section, field.name)
+            reason = None if value == getattr(section_before, field.name) else without_effect(config, field.name)
+            if reason:
+                warnings.warn(f"{field.name} = {value} changes nothing: {reason}", stacklevel=2)
 
 
 def demonstrations_of(spec: RunSpec) -> list[Episodes]:
