@@ -46,7 +46,7 @@ from hindrl_jax.types import RestorableEnvironment, action_to_env, compiler_opti
 CONFIG, METRICS, SUMMARY, PARAMETERS = "config.json", "metrics.csv", "summary.json", "parameters.npz"
 CURVE, EPISODE = "curve.png", "episode.gif"
 CHECKPOINTS, LOCK = "checkpoint", ".lock"
-SWEEP, SWEEP_CURVES = "sweep.csv", "sweep.png"
+SWEEP_SETTINGS, SWEEP, SWEEP_CURVES = "sweep.json", "sweep.csv", "sweep.png"
 FROM_PYTHON = "given from Python"
 _FILES = (CONFIG, METRICS, SUMMARY, PARAMETERS, CURVE, EPISODE)
 _ROW_FIELDS = [field.name for field in dataclasses.fields(Row) if field.name != "metrics"]
@@ -174,9 +174,10 @@ class RunWriter:
             self._lock.release()
         self.rows_written = 0
         self.started = False
+        self.runs = [self]
 
     def _take_lock(self) -> None:
-        """Keeps other processes out until `finish`, or until this one ends, however it ends."""
+        """Keeps other processes out until `close`, or until this one ends, however it ends."""
         try:
             self._lock.acquire()
         except filelock.Timeout:
@@ -230,9 +231,14 @@ class RunWriter:
             except UserError as error:
                 warnings.warn(f"no {EPISODE}: {error}", stacklevel=2)
         shutil.rmtree(self.path / CHECKPOINTS, ignore_errors=True)  # last, so that a process killed on the way here can be resumed
-        (self.path / LOCK).unlink(missing_ok=True)
-        self._lock.release()
+        self.close()
         return summary
+
+    def close(self) -> None:
+        """Lets other processes write the directory. `finish` does it, too."""
+        if self._lock.is_locked:
+            (self.path / LOCK).unlink(missing_ok=True)
+            self._lock.release()
 
     def files(self) -> list[str]:
         """Names of what has been written."""
@@ -240,22 +246,45 @@ class RunWriter:
 
 
 class SweepWriter:
-    """Writes a sweep: a run's directory for each setting, `sweep.csv` with a row for each, and their curves in `sweep.png`."""
+    """Writes a sweep: a run's directory for each setting, `sweep.csv` with a row for each, and their curves in `sweep.png`.
 
-    def __init__(self, path: Path, spec: RunSpec, settings: list[dict[str, float]], *, overwrite: bool):
+    `sweep.json` lists the settings, in order; checkpoints are those of the whole sweep.
+    """
+
+    def __init__(self, path: Path, spec: RunSpec, settings: list[dict[str, float]], *, overwrite: bool = False, resume: bool = False):
         """Only checks, as `RunWriter` does; `settings` are the swept fields and their values, in order of the runs.
 
         Raises:
           ValueError: if a config refuses a value.
-          UserError: if the path holds something else, or a sweep and `overwrite` is off, or cannot be written.
+          UserError: if the path holds something else, or a sweep and neither `overwrite` nor `resume` is on, or cannot be written.
         """
-        self.path, self.settings = path, settings
-        there = [name for name in (*_FILES, SWEEP, SWEEP_CURVES) if (path / name).exists()]
-        if there and not (overwrite and SWEEP in there):
+        self.path, self.settings, self.resume = path, settings, resume
+        there = [name for name in (*_FILES, SWEEP_SETTINGS, SWEEP, SWEEP_CURVES) if (path / name).exists()]
+        if there and not ((overwrite or resume) and SWEEP_SETTINGS in there):
             raise UserError(f"{path} already holds {', '.join(there)}: choose another --out, or replace a sweep with --overwrite")
-        folders = [",".join(f"{name}={value!r}" for name, value in setting.items()) for setting in settings]
         specs = [dataclasses.replace(spec, config=with_values(spec.config, setting)) for setting in settings]
-        self.runs = [RunWriter(path / folder, spec, overwrite=overwrite) for folder, spec in zip(folders, specs, strict=True)]
+        folders = map(_setting_folder, settings)
+        self.runs = [RunWriter(path / folder, spec, overwrite=overwrite, resume=resume) for folder, spec in zip(folders, specs, strict=True)]
+
+    @property
+    def started(self) -> bool:
+        """Whether `start` was called."""
+        return self.runs[-1].started
+
+    def start(self) -> None:
+        """Starts the run of each setting.
+
+        Raises:
+          UserError: if the directory cannot be written, or another process writes it.
+        """
+        for run in self.runs:
+            run.start()
+        with disk_trouble(self.path):
+            for name in (SWEEP, SWEEP_CURVES):
+                (self.path / name).unlink(missing_ok=True)
+            if not self.resume:
+                shutil.rmtree(self.path / CHECKPOINTS, ignore_errors=True)
+            _write_atomically(self.path / SWEEP_SETTINGS, json.dumps(self.settings, indent=2) + "\n")
 
     def finish(self, result: Result) -> list[dict[str, Any]]:
         """Finishes the run of each setting, then writes the table and the picture; returns the rows of the table.
@@ -286,7 +315,36 @@ class SweepWriter:
                 writer.writeheader()
                 writer.writerows(table)
             plots.save_sweep(parts, [writer.path.name for writer in self.runs], self.path / SWEEP_CURVES)
+        shutil.rmtree(self.path / CHECKPOINTS, ignore_errors=True)
         return table
+
+    def close(self) -> None:
+        """Lets other processes write the directories of the settings. `finish` does it, too."""
+        for run in self.runs:
+            run.close()
+
+
+def _setting_folder(setting: dict[str, float]) -> str:
+    return ",".join(f"{name}={value!r}" for name, value in setting.items())
+
+
+def read_sweep(path: Path) -> tuple[RunSpec, list[dict[str, float]]]:
+    """What a sweep was asked to do, and its settings in order.
+
+    Raises:
+      UserError: if the directory does not hold one.
+    """
+    file = path / SWEEP_SETTINGS
+    try:
+        settings = json.loads(file.read_text())
+        spec = read_spec(path / _setting_folder(settings[0]))
+        for setting in settings:
+            with_values(spec.config, setting)
+    except UserError:
+        raise
+    except (OSError, UnicodeDecodeError, ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
+        raise UserError(f"{file} does not tell the settings of a sweep ({one_line(error)}): start the sweep again") from error
+    return spec, settings
 
 
 def save_run(path: str | os.PathLike[str], result: Result, *, demos: str = FROM_PYTHON, overwrite: bool = False) -> dict[str, Any]:

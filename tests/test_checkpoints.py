@@ -17,8 +17,9 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 import hindrl_jax as hindrl
-from hindrl_jax import devices, experiment
+from hindrl_jax import cli, devices, experiment
 from hindrl_jax.checkpoints import Checkpoints
+from hindrl_jax.cli import training
 from hindrl_jax.config import AgentConfig, BatchConfig, TrainConfig
 from hindrl_jax.runs import RunSpec, RunWriter
 
@@ -311,6 +312,33 @@ def test_sigterm_ends_a_run_that_can_be_resumed(tmp_path):
     printed = run("--resume", tmp_path / "run")
     assert f"going on at step {int(folder.name):,}" in printed
     assert hindrl.load_run(tmp_path / "run").spec.seeds == (0, 1)
+
+
+def test_a_sweep_that_was_stopped_is_resumed(tmp_path, monkeypatch):
+    """In process: SIGTERM as soon as there is an evaluation; the whole sweep is trained beside it."""
+    arguments = ["sweep", "--over", "learning_rate=1e-3,2e-3", *TRAIN, "--steps", "120", "--eval-every", "20", "--out"]
+    cli.main([*arguments, str(tmp_path / "whole")])
+    out = tmp_path / "sweep"
+    advance = training.advance
+
+    def advance_and_stop(progress, bar, result):
+        advance(progress, bar, result)
+        if result.rows:
+            signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(training, "advance", advance_and_stop)
+    with pytest.raises(SystemExit) as stop:
+        cli.main([*arguments, str(out)])
+    assert stop.value.code == 128 + signal.SIGTERM
+    assert not (out / "sweep.csv").exists()
+    monkeypatch.undo()
+    cli.main(["sweep", "--resume", str(out)])
+    for folder in ("learning_rate=0.001", "learning_rate=0.002"):
+        assert_same_run(out / folder, tmp_path / "whole" / folder)
+    assert (out / "sweep.csv").read_text() == (tmp_path / "whole" / "sweep.csv").read_text()
+    assert not (out / "checkpoint").exists()
+    with pytest.raises(SystemExit):  # it is finished
+        cli.main(["sweep", "--resume", str(out)])
 
 
 @pytest.mark.slow

@@ -112,7 +112,7 @@ def test_sweep_leaves_a_run_for_each_setting(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "2 seeds from 5, 2 settings" in printed
     folders = ["learning_rate=0.001,bc_weight=0.1", "learning_rate=0.002,bc_weight=0.1"]
-    assert sorted(file.name for file in out.iterdir()) == [*folders, "sweep.csv", "sweep.png"]
+    assert sorted(file.name for file in out.iterdir()) == [*folders, "sweep.csv", "sweep.json", "sweep.png"]
     rows = list(csv.DictReader((out / "sweep.csv").read_text().splitlines()))
     assert [[row[name] for name in ("learning_rate", "bc_weight", "seeds", "seeds_reaching_95", "median_steps_to_95")] for row in rows] == [
         ["0.001", "0.1", "2", "0", ""],
@@ -126,7 +126,7 @@ def test_sweep_leaves_a_run_for_each_setting(tmp_path, capsys):
         assert [(row["seed"], row["env_steps"]) for row in metrics] == [("5", "240"), ("6", "240"), ("5", "260"), ("6", "260")]
     first, second = (np.load(out / folder / "parameters.npz")["policy/params/Dense_0/kernel"] for folder in folders)
     assert np.abs(first - second).max() > 0.0
-    assert "already holds sweep.csv" in refusal(capsys, "sweep", "--over", "gamma=0.9,0.8", "--out", out, *TINY)
+    assert "already holds sweep.json, sweep.csv" in refusal(capsys, "sweep", "--over", "gamma=0.9,0.8", "--out", out, *TINY)
     assert "already holds config.json" in refusal(capsys, "sweep", "--over", "gamma=0.9,0.8", "--overwrite", "--out", out / folders[0], *TINY)
 
 

@@ -31,7 +31,7 @@ from hindrl_jax.errors import UserError, one_line
 from hindrl_jax.experiment import Diverged, Result, check_trainable, fit, record_demonstrations
 from hindrl_jax.presets import ORIGINAL_RULES, Preset, preset
 from hindrl_jax.registry import TASKS, checked, did_you_mean, make, task
-from hindrl_jax.runs import CHECKPOINTS, FROM_PYTHON, SUMMARY, RunSpec, RunWriter, SweepWriter, read_spec, summarise
+from hindrl_jax.runs import CHECKPOINTS, FROM_PYTHON, SUMMARY, SWEEP, RunSpec, RunWriter, SweepWriter, read_spec, read_sweep, summarise
 from hindrl_jax.types import Episodes
 
 
@@ -51,7 +51,7 @@ class TrainOptions:
     """Replace a run that is already there."""
     checkpoint_every: float = 60.0
     """Seconds between two checkpoints, which are also written at Ctrl-C and SIGTERM, and removed at the end; 0 writes none. Not with several
-    hosts, nor by `hindrl sweep`."""
+    hosts."""
     distributed: bool = False
     """Share the seeds with other hosts: start the same command on each of them. The first one writes. Clusters that JAX knows (SLURM, Open
     MPI, Kubernetes, TPU) need nothing else; others need the three options below."""
@@ -74,31 +74,28 @@ class SweepOptions(TrainOptions):
 
 @dataclasses.dataclass(frozen=True)
 class ResumeOptions:
-    """Options of `hindrl train --resume`."""
+    """Options of `hindrl train --resume` and `hindrl sweep --resume`."""
 
     resume: Path
-    """Directory of the run."""
+    """Directory of the run or of the sweep."""
     checkpoint_every: float = TrainOptions.checkpoint_every
     """Seconds between two checkpoints; 0 writes none."""
 
 
 def train(arguments: list[str]) -> None:
     """Train policies from demonstrations."""
-    resumed = peek(arguments, "resume") is not None
-    if resumed:
-        options = parse(ResumeOptions, arguments, "hindrl train --resume DIRECTORY", "Go on with a run that was stopped or killed.")
-        spec, out = read_spec(options.resume), options.resume
+    if peek(arguments, "resume") is not None:
+        options = _parse_resume(arguments, "hindrl train")
+        out, spec = options.resume, read_spec(options.resume)
         if (out / SUMMARY).exists():
             raise UserError(f"{out} is finished, so there is nothing to resume: look at it with `hindrl eval {out}`")
+        writer = RunWriter(out, spec, resume=True)
     else:
         spec, options = parse_train(arguments)
         out = options.out or _default_out(spec)
-    writer = RunWriter(out, spec, overwrite=not resumed and options.overwrite, resume=resumed)
-    if not options.checkpoint_every >= 0:
-        raise UserError(f"--checkpoint-every {options.checkpoint_every} is not usable: give a number of seconds, or 0 for no checkpoints")
-    checkpoints = Checkpoints(out / CHECKPOINTS, seconds=options.checkpoint_every or math.inf) if options.checkpoint_every or resumed else None
-    with contextlib.nullcontext(True) if resumed else _hosts(options) as writes:
-        result = _fit(spec, [spec.config], [writer] if writes else [], None if jax.process_count() > 1 else checkpoints)
+        writer = RunWriter(out, spec, overwrite=options.overwrite)
+    with contextlib.closing(writer), _hosts(options) as writes:
+        result = _fit(spec, [spec.config], writer if writes else None, _checkpoints(out, options))
         if writes:
             summary = writer.finish(result)
             console.print(_summary_table(summary))
@@ -108,16 +105,36 @@ def train(arguments: list[str]) -> None:
 
 def sweep(arguments: list[str]) -> None:
     """Train with several values of hyperparameters, side by side."""
-    spec, options = parse_train(arguments, SweepOptions, "hindrl sweep")
-    settings = list(_grid(options.over, spec.config))
-    out = options.out or _default_out(spec, "sweep")
-    writer = checked(lambda: SweepWriter(out, spec, settings, overwrite=options.overwrite))
-    with _hosts(options) as writes:
-        result = _fit(spec, [run.spec.config for run in writer.runs], writer.runs if writes else [])
+    if peek(arguments, "resume") is not None:
+        options = _parse_resume(arguments, "hindrl sweep")
+        out, (spec, settings) = options.resume, read_sweep(options.resume)
+        if (out / SWEEP).exists():
+            raise UserError(f"{out} is finished, so there is nothing to resume: look at {out / SWEEP}")
+        writer = SweepWriter(out, spec, settings, resume=True)
+    else:
+        spec, options = parse_train(arguments, SweepOptions, "hindrl sweep")
+        settings = list(_grid(options.over, spec.config))
+        out = options.out or _default_out(spec, "sweep")
+        writer = checked(lambda: SweepWriter(out, spec, settings, overwrite=options.overwrite))
+    with contextlib.closing(writer), _hosts(options) as writes:
+        result = _fit(spec, [run.spec.config for run in writer.runs], writer if writes else None, _checkpoints(out, options))
         if writes:
             console.print(_sweep_table(writer.finish(result), list(settings[0])))
             console.print(_speed_line(summarise(result)))
             console.print(f"wrote {out}: sweep.csv, sweep.png, and a run's directory for each setting")
+
+
+def _parse_resume(arguments: list[str], program: str) -> ResumeOptions:
+    return parse(ResumeOptions, arguments, f"{program} --resume DIRECTORY", "Go on with what was stopped or killed.")
+
+
+def _checkpoints(out: Path, options: TrainOptions | ResumeOptions) -> Checkpoints | None:
+    """Where checkpoints are kept, if they are; None with several hosts."""
+    seconds = options.checkpoint_every
+    if not seconds >= 0:
+        raise UserError(f"--checkpoint-every {seconds} is not usable: give a number of seconds, or 0 for no checkpoints")
+    resumes = isinstance(options, ResumeOptions)
+    return Checkpoints(out / CHECKPOINTS, seconds=seconds or math.inf) if (seconds or resumes) and jax.process_count() == 1 else None
 
 
 def _sweep_table(rows: Sequence[dict[str, Any]], swept: Sequence[str]) -> Table:
@@ -164,8 +181,11 @@ def _grid(over: Sequence[str], config: TrainConfig) -> Iterator[dict[str, float]
 
 
 @contextlib.contextmanager
-def _hosts(options: TrainOptions) -> Iterator[bool]:
+def _hosts(options: TrainOptions | ResumeOptions) -> Iterator[bool]:
     """Joins the other hosts, if there are any; yields whether this is the host that writes and prints."""
+    if isinstance(options, ResumeOptions):
+        yield True
+        return
     given = {name: getattr(options, name) for name in ("coordinator", "num_hosts", "host")}
     if not options.distributed:
         for name, value in given.items():
@@ -189,15 +209,15 @@ def _hosts(options: TrainOptions) -> Iterator[bool]:
     jax.distributed.shutdown()  # waits for the others; so after a failure, which they must notice, it is left out
 
 
-def _fit(spec: RunSpec, configs: Sequence[TrainConfig], writers: Sequence[RunWriter], checkpoints: Checkpoints | None = None) -> Result:
-    """Trains all seeds of all configs at once, with a progress bar; each writer gets the runs of its config. Without writers, quietly."""
-    resumes = bool(writers) and writers[0].resume
+def _fit(spec: RunSpec, configs: Sequence[TrainConfig], writer: RunWriter | SweepWriter | None, checkpoints: Checkpoints | None) -> Result:
+    """Trains all seeds of all configs at once, with a progress bar; each of the writer's runs gets those of its config. Without it, quietly."""
+    resumes = writer is not None and writer.resume
     demonstrations = checkpoints.load_demonstrations() if resumes and checkpoints.has_demonstrations else demonstrations_of(spec)
     num_seeds = len(spec.seeds)
     seeds = f"seed {spec.seeds[0]}" if num_seeds == 1 else f"{num_seeds} seeds from {spec.seeds[0]}"
     settings = f", {len(configs)} settings" if len(configs) > 1 else ""
     runs = dict(seeds=spec.seeds * len(configs), config=[config for config in configs for _ in spec.seeds])
-    if not writers:
+    if writer is None:
         return fit(spec.env, demonstrations * len(configs), **runs)
     console.print(f"{spec.env.name}, {spec.config.algo}, {counted(demonstrations[0].lengths.shape[0], 'demonstration')}, {seeds}{settings}")
 
@@ -207,8 +227,7 @@ def _fit(spec: RunSpec, configs: Sequence[TrainConfig], writers: Sequence[RunWri
 
         def begin(result: Result) -> None:
             nonlocal began_at
-            for writer in writers:
-                writer.start()
+            writer.start()
             if checkpoints is not None:
                 checkpoints.save_demonstrations(demonstrations)
             began_at = result.steps_done
@@ -218,21 +237,21 @@ def _fit(spec: RunSpec, configs: Sequence[TrainConfig], writers: Sequence[RunWri
             stop_signals.note()
 
         def report(result: Result) -> None:
-            rows_shown = len(configs) * writers[0].rows_written
-            if not writers[0].started:
+            rows_shown = len(configs) * writer.runs[0].rows_written
+            if not writer.started:
                 begin(result)
                 rows_shown = len(result.rows)
             elif progress.tasks[bar].completed == began_at:
                 progress.console.print(f"first updates after {time.perf_counter() - STARTED:.1f} s")
-            for index, writer in enumerate(writers):
-                writer.report(result.rows_of(slice(index * num_seeds, (index + 1) * num_seeds)))
+            for index, run in enumerate(writer.runs):
+                run.report(result.rows_of(slice(index * num_seeds, (index + 1) * num_seeds)))
             if result.rows[rows_shown:]:
                 progress.console.print(_evaluation_line(result.rows[rows_shown:]))
             advance(progress, bar, result)
             if checkpoints is not None:
                 checkpoints.save_when_due(result)
             if stop_signals.received is not None and result.final_success is None:
-                _stop(result, stop_signals.received, writers[0].path, checkpoints)
+                _stop(result, stop_signals.received, writer, checkpoints)
 
         restore = {} if checkpoints is None else {"restore": checkpoints.restore}
         try:
@@ -269,13 +288,13 @@ class _StopSignals:
         self._put_back()
 
 
-def _stop(result: Result, number: int, out: Path, checkpoints: Checkpoints | None) -> None:
+def _stop(result: Result, number: int, writer: RunWriter | SweepWriter, checkpoints: Checkpoints | None) -> None:
     """Ends the process as the signal asks, with a checkpoint."""
     if checkpoints is None:
         said = "no checkpoint was asked for"
     else:
         checkpoints.save(result)
-        said = f"go on with `hindrl train --resume {out}`"
+        said = f"go on with `hindrl {'sweep' if isinstance(writer, SweepWriter) else 'train'} --resume {writer.path}`"
     print(f"hindrl: stopped after {result.steps_done:,} of {result.config.steps:,} steps; {said}", file=sys.stderr)
     sys.exit(128 + number)
 
@@ -291,9 +310,6 @@ def _speed_line(summary: dict[str, Any]) -> str:
         f"{summary['train_seconds']:.1f} s of training after {summary['compile_seconds']:.1f} s of compilation, "
         f"peak memory {summary['peak_memory_bytes'] / 2**20:,.0f} MiB"
     )
-
-
-_RESUME = "Go on with the run of a directory that was stopped or killed, as if it had never been; needs no other option."
 
 
 def parse_train(arguments: list[str], options_class: type[TrainOptions] = TrainOptions, program: str = "hindrl train") -> tuple[RunSpec, Any]:
@@ -315,7 +331,7 @@ def parse_train(arguments: list[str], options_class: type[TrainOptions] = TrainO
         ("env", Literal[tuple(TASKS)], spec.env.name, "The environment; `hindrl envs` lists them."),
         ("preset", Preset, chosen["preset"] or "default", "Where the other defaults come from: our recipe, the thesis, or its original code."),
         ("config", Path | None, None, "Run again what a config.json (or the directory of a run) says; other flags change it."),
-        *([("resume", Path | None, None, _RESUME)] if options_class is TrainOptions else []),
+        ("resume", Path | None, None, "Go on with the run, or sweep, of a directory that was stopped or killed, as if it had never been."),
         ("options", options_class, options_class(demos=spec.demos), ""),
         ("training", TrainConfig, spec.config, ""),
         ("environment", environment_class, spec.env, ""),
