@@ -12,7 +12,7 @@ from typing import Any
 import jax
 
 from hindrl_jax import __version__
-from hindrl_jax.cli import demonstrations, environments, playing, reproduction, training
+from hindrl_jax.cli import comparison, demonstrations, environments, playing, reproduction, training
 from hindrl_jax.errors import UserError, one_line
 from hindrl_jax.registry import did_you_mean
 
@@ -22,6 +22,7 @@ COMMANDS: dict[str, Command | dict[str, Command]] = {
     "sweep": training.sweep,
     "eval": playing.evaluate,
     "render": playing.render,
+    "compare": comparison.compare,
     "demos": {"record": demonstrations.record, "info": demonstrations.info, "plot": demonstrations.plot, "render": demonstrations.render},
     "reproduce": {"ablation": reproduction.ablate},
     "envs": environments.show,
