@@ -124,3 +124,11 @@ def test_an_interrupted_training_leaves_the_line_clean():
     with pytest.raises(KeyboardInterrupt):
         train()
     assert screen.file.getvalue().endswith(WIPE)
+
+
+def test_a_resumed_training_says_only_what_is_new():
+    screen = console()
+    progress = hindrl.ProgressBar(console=screen, lines=4)
+    for done in range(2_100, 4_001, 100):
+        progress(result(done))
+    assert [line.split()[0] for line in screen.file.getvalue().splitlines()] == ["3,000", "4,000"]
