@@ -17,6 +17,8 @@ MARGIN = 12
 """Pixels."""
 CAPTION_HEIGHT = 62
 """Pixels."""
+LINGER = 1.0
+"""Seconds that the last picture of an episode stays longer."""
 BACKGROUND = (255, 255, 255)
 INK = (38, 44, 54)
 FAINT_INK = (110, 118, 130)
@@ -26,7 +28,6 @@ BLUE = (47, 111, 214)
 _NUM_COLOURS = 255  # of a GIF's 256, one is left over to mean "as in the picture before"
 _MIN_SHARE = 0.0002  # of all pixels, from which on a colour is kept exactly
 _MAX_EXACT = 128  # colours kept exactly, at most
-_LINGER = 1.0  # s, how much longer the last picture of a GIF stays
 
 
 @lru_cache(maxsize=64)
@@ -97,17 +98,17 @@ def save_png(picture: np.ndarray, path: str | PathLike) -> None:
     Image.fromarray(picture).save(path, format="PNG")
 
 
-def save_gif(pictures: Sequence[np.ndarray], path: str | PathLike, seconds: Sequence[float]) -> None:
+def save_gif(pictures: Sequence[np.ndarray], seconds: Sequence[float], path: str | PathLike) -> None:
     """Saves an endlessly repeated animation.
 
     Args:
       pictures: (H, W, 3) uint8 each.
-      path: file to write.
       seconds: how long each picture is shown; the last one stays a second longer. Programs that show GIFs round to hundredths.
+      path: file to write.
     """
     images = _to_palette_images(pictures)
     durations = [round(1000 * s) for s in seconds]
-    durations[-1] += round(1000 * _LINGER)
+    durations[-1] += round(1000 * LINGER)
     images[0].save(path, format="GIF", save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=False)
 
 

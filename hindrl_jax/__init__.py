@@ -22,8 +22,11 @@ STARTED = time.perf_counter()  # this package loads before the large ones it use
 # Loaded on first use: `envs` and `experts` import the core below this package, and the names here import `envs` and `experts`.
 _EXPORTS = {
     "Checkpoints": "hindrl_jax.checkpoints",
+    "ProgressBar": "hindrl_jax.progress",
     "Result": "hindrl_jax.experiment",
+    "TensorBoardReporter": "hindrl_jax.reporters",
     "UserError": "hindrl_jax.errors",
+    "WandbReporter": "hindrl_jax.reporters",
     "fit": "hindrl_jax.experiment",
     "load_demonstrations": "hindrl_jax.datasets",
     "load_run": "hindrl_jax.runs",

@@ -8,8 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hindrl_jax.statistics import bootstrap_band
+
 if TYPE_CHECKING:
     from hindrl_jax.ablation import Outcome
+    from hindrl_jax.comparison import Axis, RecordedRun
     from hindrl_jax.experiment import Result
 
 _MEAN, _SEED, _DEMO = "#1f5fa8", "#9dbfe3", "#c77b00"
@@ -17,19 +20,21 @@ _VERDICTS = {"better": "#1f5fa8", "worse": "#b3261e", "open": "0.5"}
 
 
 def save_curve(result: Result, path: Path) -> None:
-    """Draws success and episode length over training, one thin line per seed and their mean, as a PNG."""
+    """Draws success and episode length over training, one thin line per seed, their mean and its 95% bootstrap interval, as a PNG."""
     plt = _pyplot()
     x, success, length = _curves(result)
     figure, axes = plt.subplots(2, 1, figsize=(7, 5.5), sharex=True, height_ratios=(3, 2), layout="constrained")
     for axis, values in zip(axes, (success, length), strict=True):
         if len(result.seeds) > 1:
-            axis.plot(x, values, color=_SEED, linewidth=0.9)
+            axis.plot(x, values, color=_SEED, linewidth=0.6)
+            _band(axis, x, values, _MEAN)
         axis.plot(x, values.mean(axis=1), color=_MEAN, linewidth=2, marker="o", markersize=3, label=_mean_label(result))
     lengths = np.asarray(result.guidance.demonstrations.lengths)
     axes[1].axhline(lengths.mean(), color=_DEMO, linestyle="--", linewidth=1, label="demonstrations")
     axes[0].legend(loc="lower right", frameon=False)
     axes[1].set(ylim=(0, result.env.horizon * 1.05), ylabel="episode length, steps", xlabel=_x_label(result))
     axes[1].legend(loc="lower left", frameon=False)
+    axes[1].xaxis.set_major_formatter("{x:,.0f}")
     axes[0].set_title(_title(result), loc="left")
     _mark_success(axes[0])
     _tidy(axes)
@@ -50,6 +55,35 @@ def save_sweep(parts: Sequence[Result], labels: Sequence[str], path: Path) -> No
     axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize="small")
     seeds = f", mean of {len(parts[0].seeds)} seeds" if len(parts[0].seeds) > 1 else ""
     axis.set_title(_title(parts[0]) + seeds, loc="left")
+    _mark_success(axis)
+    _tidy([axis])
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def save_comparison(runs: Sequence[RecordedRun], path: Path, *, over: Axis) -> None:
+    """Draws success over training for several runs: the mean over seeds and its 95% bootstrap interval, as a PNG.
+
+    A run without steps of that kind, bc over environment steps, is a dashed line at the height of its end.
+    """
+    plt = _pyplot()
+    palette = plt.get_cmap("tab10").colors if len(runs) <= 10 else plt.get_cmap("viridis")(np.linspace(0.0, 0.95, len(runs)))
+    figure, axis = plt.subplots(figsize=(8.5, 4.5), layout="constrained")
+    for run, colour in zip(runs, palette, strict=False):
+        x, success = run.axis(over), 100 * run.success
+        label = run.label if run.finished else f"{run.label} (not finished)"
+        if not x.any():
+            axis.axhline(100 * run.final_success.mean(), color=colour, linestyle="--", linewidth=1.5, label=f"{label}, at its end")
+            continue
+        axis.plot(x, success.mean(axis=1), color=colour, linewidth=2, marker="o", markersize=2.5, label=label)
+        if success.shape[1] > 1:
+            _band(axis, x, success, colour)
+    axis.set(xlabel={"steps": "environment steps", "updates": "gradient steps", "seconds": "seconds of training, all seeds side by side"}[over])
+    axis.set_xlim(left=0)
+    axis.xaxis.set_major_formatter("{x:,.0f}")
+    axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize="small")
+    names = dict.fromkeys(run.spec.env.name for run in runs)
+    axis.set_title(f"{', '.join(names)}: mean over seeds, 95% interval", loc="left")
     _mark_success(axis)
     _tidy([axis])
     figure.savefig(path, dpi=130)
@@ -139,6 +173,12 @@ def _curves(result: Result) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return table[:, 0, 0], table[:, :, 1], table[:, :, 2]
 
 
+def _band(axis: Any, x: np.ndarray, values: np.ndarray, colour: Any) -> None:
+    """Shades the 95% interval of the mean of values (evaluations, S), S > 1."""
+    low, high = bootstrap_band(values)
+    axis.fill_between(x, low, high, color=colour, alpha=0.18, linewidth=0)
+
+
 def _mark_success(axis: Any) -> None:
     """Prepares an axis that shows success."""
     axis.axhline(95, color="0.6", linestyle=":", linewidth=1)
@@ -162,4 +202,4 @@ def _title(result: Result) -> str:
 
 
 def _mean_label(result: Result) -> str:
-    return f"mean of {len(result.seeds)} seeds" if len(result.seeds) > 1 else f"seed {result.seeds[0]}"
+    return f"mean of {len(result.seeds)} seeds, 95% interval" if len(result.seeds) > 1 else f"seed {result.seeds[0]}"

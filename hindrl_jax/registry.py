@@ -28,7 +28,7 @@ class Task:
     expert: type[Any]
     """Frozen dataclass with a method act(key, env, state)."""
     viewer_module: str
-    """Module with save_png(env, state, path) and save_gif(env, states, path); imported only to draw."""
+    """Module with save_png(env, state, path), save_gif(env, states, path) and animation(env, states); imported only to draw."""
     family: Family
     """Which of the presets' recipes is for it."""
     summary: str

@@ -21,9 +21,9 @@ import shutil
 import sys
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 import filelock
 import jax
@@ -39,9 +39,13 @@ from hindrl_jax.config import TrainConfig, with_values
 from hindrl_jax.datasets import why_unwritable
 from hindrl_jax.errors import UserError, one_line
 from hindrl_jax.experiment import Result, Row
+from hindrl_jax.films import check_film, save_film
 from hindrl_jax.goals import GoalTable, sample_goals
-from hindrl_jax.registry import checked, did_you_mean, make, viewer
+from hindrl_jax.registry import checked, did_you_mean, make
 from hindrl_jax.types import RestorableEnvironment, action_to_env, compiler_options
+
+if TYPE_CHECKING:
+    from hindrl_jax.reporters import Reporter
 
 CONFIG, METRICS, SUMMARY, PARAMETERS = "config.json", "metrics.csv", "summary.json", "parameters.npz"
 CURVE, EPISODE = "curve.png", "episode.gif"
@@ -146,7 +150,7 @@ def _refuse_unknown(data: dict[str, Any], known: Any, where: Path) -> None:
 class RunWriter:
     """Writes a run's directory, file by file, as the run goes. Use `save_run` for a run that is already finished."""
 
-    def __init__(self, path: Path, spec: RunSpec, *, overwrite: bool = False, resume: bool = False):
+    def __init__(self, path: Path, spec: RunSpec, *, overwrite: bool = False, resume: bool = False, reporters: Sequence[type[Reporter]] = ()):
         """Only checks; nothing is written or removed before `start`.
 
         Args:
@@ -154,10 +158,11 @@ class RunWriter:
           spec: what the run is asked to do.
           overwrite: replace a run that is there.
           resume: go on with the run that is there; its checkpoints are kept.
+          reporters: kinds of reporters to tell everything.
 
         Raises:
           UserError: if the path is a file, cannot be written, is written by another process, or holds (part of) a run and neither
-            `overwrite` nor `resume` is on.
+            `overwrite` nor `resume` is on; or if a reporter lacks something.
         """
         self.path, self.spec, self.resume = path, spec, resume
         self._lock = filelock.FileLock(path / LOCK, timeout=0)
@@ -172,6 +177,7 @@ class RunWriter:
         if (path / LOCK).exists():
             self._take_lock()
             self._lock.release()
+        self.reporters = [kind(path) for kind in reporters]
         self.rows_written = 0
         self.started = False
         self.runs = [self]
@@ -192,6 +198,8 @@ class RunWriter:
         with disk_trouble(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
             self._take_lock()
+            for reporter in self.reporters:  # before anything is removed, since they have the most reasons not to start
+                reporter.start(self.spec)
             for name in _FILES:
                 (self.path / name).unlink(missing_ok=True)
             if not self.resume:
@@ -201,6 +209,8 @@ class RunWriter:
 
     def report(self, rows: list[Row]) -> None:
         """Appends to `metrics.csv` those of the run's evaluations so far that are new since the last call."""
+        for reporter in self.reporters:
+            reporter.report(rows)
         rows = rows[self.rows_written :]
         if not rows:
             return
@@ -225,6 +235,8 @@ class RunWriter:
             _save_parameters(self.path / PARAMETERS, result)
             _write_atomically(self.path / SUMMARY, json.dumps(summary, indent=2) + "\n")
             plots.save_curve(result, self.path / CURVE)
+        for reporter in self.reporters:
+            reporter.finish(result.summaries())
         if film:
             try:
                 load_run(self.path).render(self.path / EPISODE)
@@ -242,7 +254,8 @@ class RunWriter:
 
     def files(self) -> list[str]:
         """Names of what has been written."""
-        return [name for name in _FILES if (self.path / name).exists()]
+        names = [*_FILES, *(reporter.folder for reporter in self.reporters)]
+        return [name for name in names if (self.path / name).exists()]
 
 
 class SweepWriter:
@@ -251,7 +264,16 @@ class SweepWriter:
     `sweep.json` lists the settings, in order; checkpoints are those of the whole sweep.
     """
 
-    def __init__(self, path: Path, spec: RunSpec, settings: list[dict[str, float]], *, overwrite: bool = False, resume: bool = False):
+    def __init__(
+        self,
+        path: Path,
+        spec: RunSpec,
+        settings: list[dict[str, float]],
+        *,
+        overwrite: bool = False,
+        resume: bool = False,
+        reporters: Sequence[type[Reporter]] = (),
+    ):
         """Only checks, as `RunWriter` does; `settings` are the swept fields and their values, in order of the runs.
 
         Raises:
@@ -263,8 +285,8 @@ class SweepWriter:
         if there and not ((overwrite or resume) and SWEEP_SETTINGS in there):
             raise UserError(f"{path} already holds {', '.join(there)}: choose another --out, or replace a sweep with --overwrite")
         specs = [dataclasses.replace(spec, config=with_values(spec.config, setting)) for setting in settings]
-        folders = map(_setting_folder, settings)
-        self.runs = [RunWriter(path / folder, spec, overwrite=overwrite, resume=resume) for folder, spec in zip(folders, specs, strict=True)]
+        choices = dict(overwrite=overwrite, resume=resume, reporters=reporters)
+        self.runs = [RunWriter(path / _setting_folder(setting), spec, **choices) for setting, spec in zip(settings, specs, strict=True)]
 
     @property
     def started(self) -> bool:
@@ -475,52 +497,44 @@ class Run:
 
         return act
 
-    def render(self, path: Path, *, seed: int | None = None, key: jax.Array | None = None, stochastic: bool = False) -> bool:
-        """Films one fresh episode of one seed's policy (the first seed's by default); returns whether it solved the task.
+    def render(self, path: Path, *, seed: int | None = None, key: jax.Array | None = None, stochastic: bool = False) -> int:
+        """Films fresh episodes of one seed's policy (the first seed's by default); returns how many of them solved the task.
 
         Args:
-          path: a .gif file, or a .png file for the last state alone.
+          path: a .gif or .mp4 file, or a .png file for the last state alone.
           seed: one of the run's seeds.
-          key: which episode.
+          key: which episode, or (N,) keys of N episodes to be shown one after the other.
           stochastic: sample the actions.
 
         Raises:
-          UserError: if the run has no such seed.
+          UserError: if the run has no such seed, or the film cannot be drawn.
         """
         env = self.spec.env
-        _check_drawable(path)
+        keys = jnp.atleast_1d(jax.random.key(0) if key is None else key)
+        check_film(path, len(keys))
         seed = self.spec.seeds[0] if seed is None else seed
         if seed not in self.spec.seeds:
             raise UserError(f"{self.path} has no seed {seed}: choose one of {', '.join(map(str, self.spec.seeds))}")
-        act = self._act(self.spec.seeds.index(seed), stochastic=stochastic, any_goal=False)
-        episodes = player(env, act, 1)(jax.random.key(0) if key is None else key)
-        draw_episode(path, env, np.asarray(episodes.states[0, : int(episodes.lengths[0]) + 1]))
-        return bool(episodes.terminated[0])
+        play_episode = player(env, self._act(self.spec.seeds.index(seed), stochastic=stochastic, any_goal=False), 1)
+        played = [jax.device_get(play_episode(key_episode)) for key_episode in keys]
+        draw_episodes(path, env, [episodes.states[0, : int(episodes.lengths[0]) + 1] for episodes in played])
+        return sum(bool(episodes.terminated[0]) for episodes in played)
 
 
-def draw_episode(path: Path, env: RestorableEnvironment, states: np.ndarray) -> None:
-    """Draws an episode from its states (length + 1, S): a GIF of all of them, or a PNG of the last.
+def draw_episodes(path: Path, env: RestorableEnvironment, episodes: Sequence[np.ndarray]) -> None:
+    """Draws episodes from their states (length + 1, S each): a film of them, one after the other, or as a PNG the last state.
 
     Raises:
       UserError: for another kind of file, a place that cannot be written, or states of another environment.
     """
-    _check_drawable(path)
-    if states.shape[-1] != env.state_dim:
-        raise UserError(f"states of {states.shape[-1]} numbers are not those of {env.name}, which has {env.state_dim}: record them again")
+    check_film(path, len(episodes))
+    for states in episodes:
+        if states.shape[-1] != env.state_dim:
+            raise UserError(f"states of {states.shape[-1]} numbers are not those of {env.name}, which has {env.state_dim}: record them again")
     key = jax.random.key(0)
-    unpacked = [env.vector_to_state(key, jnp.asarray(state)) for state in states]
+    unpacked = [[env.vector_to_state(key, jnp.asarray(state)) for state in states] for states in episodes]
     with disk_trouble(path):
-        if path.suffix == ".gif":
-            viewer(env).save_gif(env, unpacked, path)
-        else:
-            viewer(env).save_png(env, unpacked[-1], path)
-
-
-def _check_drawable(path: Path) -> None:
-    if path.suffix not in (".gif", ".png"):
-        raise UserError(f"cannot draw {path.name}: the name must end in .gif or .png")
-    if not path.parent.is_dir():
-        raise UserError(f"cannot write {path}: there is no folder {path.parent}; make it first")
+        save_film(env, unpacked, path)
 
 
 @contextlib.contextmanager

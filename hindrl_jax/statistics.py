@@ -9,6 +9,7 @@ import numpy as np
 
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
+_TAILS = ((1.0 - CONFIDENCE) / 2.0, (1.0 + CONFIDENCE) / 2.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +40,42 @@ def bootstrap(values: Sequence[float] | np.ndarray, statistic: Callable[..., np.
     if len(values) < 2:
         raise ValueError(f"{len(values)} value has no bootstrap interval: give at least 2")
     draws = np.random.default_rng(0).integers(len(values), size=(RESAMPLES, len(values)))
-    tail = (1.0 - CONFIDENCE) / 2.0
-    low, high = np.quantile(statistic(values[draws], axis=1), (tail, 1.0 - tail), method="inverted_cdf")
+    low, high = np.quantile(statistic(values[draws], axis=1), _TAILS, method="inverted_cdf")
     return Interval(estimate=float(statistic(values, axis=0)), low=float(low), high=float(high))
+
+
+def bootstrap_difference(values: Sequence[float] | np.ndarray, baseline: Sequence[float] | np.ndarray, *, paired: bool) -> Interval:
+    """How much higher the mean of some values is than that of others, with a 95% interval by the same bootstrap.
+
+    Args:
+      values: (S,) one number per seed, at least two.
+      baseline: (T,) likewise.
+      paired: whether both are of the same seeds, in the same order (S = T). What a seed makes of both, an easy demonstration for one, then drops out.
+    """
+    values, baseline = np.asarray(values, np.float64), np.asarray(baseline, np.float64)
+    if paired:
+        return bootstrap(values - baseline)
+    low, high = np.quantile(_mean_draws(values[None]) - _mean_draws(baseline[None], seed=1), _TAILS, axis=0, method="inverted_cdf")[:, 0]
+    return Interval(estimate=float(values.mean() - baseline.mean()), low=float(low), high=float(high))
+
+
+def bootstrap_band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The 95% intervals of the means of a curve over seeds, each point for itself.
+
+    Args:
+      values: (E, S) E points of S seeds, at least two.
+
+    Returns:
+      The lower and upper ends, (E,) each.
+    """
+    low, high = np.quantile(_mean_draws(np.asarray(values, np.float64)), _TAILS, axis=0, method="inverted_cdf")
+    return low, high
+
+
+def _mean_draws(values: np.ndarray, *, seed: int = 0) -> np.ndarray:
+    """(RESAMPLES, E) means of (E, S) values over seeds drawn anew; the same draws for all points."""
+    num_seeds = values.shape[1]
+    if num_seeds < 2:
+        raise ValueError(f"{num_seeds} value has no bootstrap interval: give at least 2")
+    shares = np.random.default_rng(seed).multinomial(num_seeds, np.full(num_seeds, 1.0 / num_seeds), size=RESAMPLES) / num_seeds
+    return shares @ values.T

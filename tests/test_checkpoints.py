@@ -19,8 +19,8 @@ from jax.experimental.compilation_cache import compilation_cache
 import hindrl_jax as hindrl
 from hindrl_jax import cli, devices, experiment
 from hindrl_jax.checkpoints import Checkpoints
-from hindrl_jax.cli import training
 from hindrl_jax.config import AgentConfig, BatchConfig, TrainConfig
+from hindrl_jax.progress import ProgressBar
 from hindrl_jax.runs import RunSpec, RunWriter
 
 ENV = hindrl.make("FixedGridPickAndPlace", size=4, random_box_size=1, horizon=20)
@@ -319,14 +319,14 @@ def test_a_sweep_that_was_stopped_is_resumed(tmp_path, monkeypatch):
     arguments = ["sweep", "--over", "learning_rate=1e-3,2e-3", *TRAIN, "--steps", "120", "--eval-every", "20", "--out"]
     cli.main([*arguments, str(tmp_path / "whole")])
     out = tmp_path / "sweep"
-    advance = training.advance
+    show = ProgressBar.__call__
 
-    def advance_and_stop(progress, bar, result):
-        advance(progress, bar, result)
+    def show_and_stop(bar, result):
+        show(bar, result)
         if result.rows:
             signal.raise_signal(signal.SIGTERM)
 
-    monkeypatch.setattr(training, "advance", advance_and_stop)
+    monkeypatch.setattr(ProgressBar, "__call__", show_and_stop)
     with pytest.raises(SystemExit) as stop:
         cli.main([*arguments, str(out)])
     assert stop.value.code == 128 + signal.SIGTERM

@@ -108,7 +108,23 @@ def test_config_runs_again_and_other_flags_change_it(run, tmp_path):
 
 def test_sweep_leaves_a_run_for_each_setting(tmp_path, capsys):
     out = tmp_path / "sweep"
-    cli.main(["sweep", "--over", "learning-rate=1e-3,2e-3", "--over", "bc_weight=0.1", "--seeds", "2", "--seed", "5", "--out", str(out), *TINY])
+    cli.main(
+        [
+            "sweep",
+            "--over",
+            "learning-rate=1e-3,2e-3",
+            "--over",
+            "bc_weight=0.1",
+            "--seeds",
+            "2",
+            "--seed",
+            "5",
+            "--tensorboard",
+            "--out",
+            str(out),
+            *TINY,
+        ]
+    )
     printed = capsys.readouterr().out
     assert "2 seeds from 5, 2 settings" in printed
     folders = ["learning_rate=0.001,bc_weight=0.1", "learning_rate=0.002,bc_weight=0.1"]
@@ -124,6 +140,10 @@ def test_sweep_leaves_a_run_for_each_setting(tmp_path, capsys):
         assert jax.tree.leaves(run.policies)[0].shape[0] == 2
         metrics = list(csv.DictReader((out / folder / "metrics.csv").read_text().splitlines()))
         assert [(row["seed"], row["env_steps"]) for row in metrics] == [("5", "240"), ("6", "240"), ("5", "260"), ("6", "260")]
+        for name in ("seed_5", "seed_6", "mean"):
+            (events,) = (out / folder / "tensorboard" / name).iterdir()
+            assert b"evaluation/success" in events.read_bytes()
+            assert b"final/success" in events.read_bytes()
     first, second = (np.load(out / folder / "parameters.npz")["policy/params/Dense_0/kernel"] for folder in folders)
     assert np.abs(first - second).max() > 0.0
     assert "already holds sweep.json, sweep.csv" in refusal(capsys, "sweep", "--over", "gamma=0.9,0.8", "--out", out, *TINY)
@@ -171,9 +191,14 @@ def test_eval_and_render_read_the_run_back(run, tmp_path, capsys):
     film = tmp_path / "film.gif"
     cli.main(["render", str(run), "--to", str(film), "--seed", "6"])
     assert film.read_bytes().startswith(b"GIF89a")
+    capsys.readouterr()
+    cli.main(["render", str(run), "--to", str(tmp_path / "film.mp4"), "--episodes", "2"])
+    assert "0 of 2 episodes are solved" in capsys.readouterr().out
+    assert (tmp_path / "film.mp4").read_bytes()[4:8] == b"ftyp"
+    assert "too few" in refusal(capsys, "render", run, "--episodes", 0)
     assert "no seed 7" in refusal(capsys, "render", run, "--seed", 7, "--to", tmp_path / "other.gif")
     assert not (tmp_path / "other.gif").exists()
-    assert "must end in .gif or .png" in refusal(capsys, "render", run, "--to", tmp_path / "film.avi")
+    assert "must end in .gif, .mp4 or .png" in refusal(capsys, "render", run, "--to", tmp_path / "film.avi")
 
 
 def test_the_configuration_keeps_its_number_of_seeds(run):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import hindrl_jax as hindrl
-from hindrl_jax import runs
+from hindrl_jax import films, runs
 from hindrl_jax.config import SWEEPABLE, AgentConfig, BatchConfig, GoalConfig, TrainConfig, sweepable_value, with_values
 from hindrl_jax.experiment import Result, Row
 
@@ -191,7 +191,7 @@ def test_a_film_that_cannot_be_drawn_is_a_warning(saved, tmp_path, monkeypatch):
     def no_screen(env):
         raise hindrl.UserError("no OpenGL library can draw")
 
-    monkeypatch.setattr(runs, "viewer", no_screen)
+    monkeypatch.setattr(films, "viewer", no_screen)
     with pytest.warns(UserWarning, match=r"no episode\.gif: no OpenGL"):
         summary = hindrl.save_run(tmp_path, saved[0])
     assert json.loads((tmp_path / "summary.json").read_text()) == summary
@@ -219,7 +219,7 @@ def test_the_reach_recipe_runs_from_demonstration_to_evaluation(tmp_path, monkey
     assert all(np.isfinite(value) for row in result.rows for value in row.metrics.values())
     lengths = np.asarray(result.state.replay.episodes.lengths)
     assert lengths[lengths > 0].min() < int(demonstrations.lengths[0]) / 2  # of episodes that began in a demonstrated state
-    monkeypatch.setattr(runs, "draw_episode", lambda path, env, states: path.touch())
+    monkeypatch.setattr(runs, "draw_episodes", lambda path, env, episodes: path.touch())
     hindrl.save_run(tmp_path, result)
     (outcome,) = hindrl.load_run(tmp_path).evaluate(episodes=3)
     assert outcome["seed"] == 0

@@ -96,20 +96,41 @@ def save_gif(
     seconds_per_frame: float = 0.15,
     captions: Sequence[str] | None = None,
 ) -> None:
-    """Saves an endlessly repeated animation; the last picture stays a second longer.
+    """Saves what `animation` draws as an endlessly repeated one; the last picture stays a second longer.
+
+    Args:
+      path: file to write.
+      env, states, seconds_per_frame, captions: as for `animation`; programs that show GIFs round the seconds to hundredths.
+
+    Raises:
+      ValueError: if there are no states, or not one caption per state.
+    """
+    drawing.save_gif(*animation(env, states, seconds_per_frame=seconds_per_frame, captions=captions), path)
+
+
+def animation(
+    env: GridPickAndPlace | FixedGridPickAndPlace,
+    states: Sequence[GridState] | GridState,
+    *,
+    seconds_per_frame: float = 0.15,
+    captions: Sequence[str] | None = None,
+) -> tuple[list[np.ndarray], list[float]]:
+    """Draws an episode.
 
     Args:
       env: the environment that the states belong to.
       states: a list of states, or one state whose arrays have a leading time axis.
-      path: file to write.
-      seconds_per_frame: time between pictures; viewers round it to hundredths.
+      seconds_per_frame: time between states.
       captions: one caption per state, as in `frame`.
+
+    Returns:
+      The pictures, (height, width, 3) uint8 each, and how many seconds each is shown.
 
     Raises:
       ValueError: if there are no states, or not one caption per state.
     """
     pictures = [frame(env, state, caption=caption) for state, caption in drawing.captioned_states(states, captions, GridState)]
-    drawing.save_gif(pictures, path, [seconds_per_frame] * len(pictures))
+    return pictures, [seconds_per_frame] * len(pictures)
 
 
 class _Canvas:

@@ -86,7 +86,27 @@ def save_gif(
     seconds_per_frame: float = panda.CONTROL_PERIOD,
     captions: Sequence[str] | None = None,
 ) -> None:
-    """Saves an endlessly repeated animation, with the way of the hand so far; the last picture stays a second longer.
+    """Saves what `animation` draws as an endlessly repeated one; the last picture stays a second longer.
+
+    Args:
+      path: file to write.
+      env, states, seconds_per_frame, captions: as for `animation`; programs that show GIFs round the seconds to hundredths.
+
+    Raises:
+      ValueError: if there are no states, or not one caption per state.
+      UserError: if no OpenGL library can draw without a screen.
+    """
+    drawing.save_gif(*animation(env, states, seconds_per_frame=seconds_per_frame, captions=captions), path)
+
+
+def animation(
+    env: FixedParameterizedReach | ParameterizedReach,
+    states: Sequence[ReachState] | ReachState,
+    *,
+    seconds_per_frame: float = panda.CONTROL_PERIOD,
+    captions: Sequence[str] | None = None,
+) -> tuple[list[np.ndarray], list[float]]:
+    """Draws an episode, with the way of the hand so far.
 
     Of long episodes only every second state is shown, or every third, and so on, and the last one. Each is then shown for longer, so that the
     animation takes as long as it would with all of them.
@@ -94,9 +114,11 @@ def save_gif(
     Args:
       env: the environment that the states belong to.
       states: a list of states, or one state whose arrays have a leading time axis.
-      path: file to write.
-      seconds_per_frame: time between states, real time by default; viewers round it to hundredths.
+      seconds_per_frame: time between states, real time by default.
       captions: one caption per state, as in `frame`.
+
+    Returns:
+      The pictures, (height, width, 3) uint8 each, and how many seconds each is shown.
 
     Raises:
       ValueError: if there are no states, or not one caption per state.
@@ -107,7 +129,7 @@ def save_gif(
     shown = [*range(0, len(pairs) - 1, stride), len(pairs) - 1]
     way = [_stage().hand_position(state.joints) for state, _ in pairs]
     pictures = [_draw(env, pairs[i][0], pairs[i][1], way[: i + 1]) for i in shown]
-    drawing.save_gif(pictures, path, [*(seconds_per_frame * np.diff(shown)), seconds_per_frame])
+    return pictures, [*(seconds_per_frame * np.diff(shown)), seconds_per_frame]
 
 
 def _draw(env: FixedParameterizedReach | ParameterizedReach, state: ReachState, caption: str, way: Sequence[np.ndarray]) -> np.ndarray:

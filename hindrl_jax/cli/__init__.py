@@ -12,7 +12,7 @@ from typing import Any
 import jax
 
 from hindrl_jax import __version__
-from hindrl_jax.cli import demonstrations, environments, playing, reproduction, training
+from hindrl_jax.cli import comparison, demonstrations, environments, playing, reproduction, training
 from hindrl_jax.errors import UserError, one_line
 from hindrl_jax.registry import did_you_mean
 
@@ -22,6 +22,7 @@ COMMANDS: dict[str, Command | dict[str, Command]] = {
     "sweep": training.sweep,
     "eval": playing.evaluate,
     "render": playing.render,
+    "compare": comparison.compare,
     "demos": {"record": demonstrations.record, "info": demonstrations.info, "plot": demonstrations.plot, "render": demonstrations.render},
     "reproduce": {"ablation": reproduction.ablate},
     "envs": environments.show,
@@ -72,10 +73,10 @@ def main(arguments: list[str] | None = None) -> None:
         arguments = sys.argv[1:]
         _set_up_jax()
     *group, last = arguments or [""]
-    if last in ("--help", "-h") and (not group or (len(group) == 1 and isinstance(COMMANDS.get(group[0]), dict))):
-        print(_usage())
-        return
     try:
+        if last in ("--help", "-h") and (not group or (len(group) == 1 and isinstance(COMMANDS.get(group[0]), dict))):
+            print(_usage(), flush=True)
+            return
         with warnings.catch_warnings():
             warnings.showwarning = lambda message, *_, **__: print(f"hindrl: warning: {message}", file=sys.stderr)
             command, rest = _find(arguments)

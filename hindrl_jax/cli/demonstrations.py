@@ -24,7 +24,7 @@ from hindrl_jax.experiment import record_demonstrations
 from hindrl_jax.goals import epsilon_filter, epsilon_from_demonstrations, goal_table
 from hindrl_jax.plots import save_filter
 from hindrl_jax.registry import TASKS, make, task
-from hindrl_jax.runs import disk_trouble, draw_episode
+from hindrl_jax.runs import disk_trouble, draw_episodes
 from hindrl_jax.types import Episodes, RestorableEnvironment
 
 
@@ -187,22 +187,28 @@ def _check_demo(demo: int, num_demos: int, file: Path) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class RenderDemo:
-    """Film a demonstration."""
+    """Film demonstrations."""
 
     file: tyro.conf.Positional[Path]
     """The HDF5 file."""
     to: Path | None = None
-    """A .gif file, or a .png file for the last state (default: the file's name with .gif)."""
+    """A .gif or .mp4 file, or a .png file for the last state (default: the file's name with .gif). For .mp4 install av."""
     demo: int = 0
     """Which demonstration, counted from 0."""
+    episodes: int = 1
+    """How many, one after the other, from that one on."""
 
 
 def render(arguments: list[str]) -> None:
-    """Film a demonstration."""
+    """Film demonstrations."""
     options = parse(RenderDemo, arguments, "hindrl demos render")
     summary = describe_demonstrations(options.file)
     states = read_states(options.file)
-    _check_demo(options.demo, len(states), options.file)
+    if options.episodes < 1:
+        raise UserError(f"--episodes {options.episodes} is too few: film at least 1")
+    for demo in (options.demo, options.demo + options.episodes - 1):
+        _check_demo(demo, len(states), options.file)
     path = options.to or options.file.with_suffix(".gif")
-    draw_episode(path, make(summary.env_name, **summary.env_kwargs), states[options.demo])
-    console.print(f"wrote {path}: {len(states[options.demo]) - 1} steps")
+    shown = states[options.demo : options.demo + options.episodes]
+    draw_episodes(path, make(summary.env_name, **summary.env_kwargs), shown)
+    console.print(f"wrote {path}: {sum(len(one) - 1 for one in shown)} steps{f' of {len(shown)} demonstrations' if len(shown) > 1 else ''}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import jax.numpy as jnp
 import tyro
 from rich import box
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -59,24 +60,30 @@ def evaluate(arguments: list[str]) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Render:
-    """Film an episode of a run's policy."""
+    """Film episodes of a run's policy."""
 
     directory: tyro.conf.Positional[Path]
     """Directory of the run."""
     to: Path | None = None
-    """A .gif file, or a .png file for the last state (default: in DIRECTORY, named after episode and seed)."""
+    """A .gif or .mp4 file, or a .png file for the last state (default: a .gif in DIRECTORY, named after episode and seed). For .mp4 install av."""
     seed: int | None = None
     """Whose policy: one of the run's seeds (default: the first)."""
     episode: int = 0
     """Which episode: equal numbers give equal ones."""
+    episodes: int = 1
+    """How many, one after the other, from that one on."""
     stochastic: bool = False
     """Sample the actions instead of taking the mean ones."""
 
 
 def render(arguments: list[str]) -> None:
-    """Film an episode of a run's policy."""
+    """Film episodes of a run's policy."""
     options = parse(Render, arguments, "hindrl render")
+    if options.episodes < 1:
+        raise UserError(f"--episodes {options.episodes} is too few: film at least 1")
     run = load_run(options.directory)
     path = options.to or options.directory / f"episode_{options.episode}_seed_{run.spec.seeds[0] if options.seed is None else options.seed}.gif"
-    solved = run.render(path, seed=options.seed, key=episode_key(options.episode), stochastic=options.stochastic)
-    console.print(f"wrote {path}: the episode is {'solved' if solved else 'not solved'}")
+    keys = jnp.stack([episode_key(options.episode + number) for number in range(options.episodes)])
+    solved = run.render(path, seed=options.seed, key=keys, stochastic=options.stochastic)
+    single = f"the episode is {'solved' if solved else 'not solved'}"
+    console.print(f"wrote {path}: {single if options.episodes == 1 else f'{solved} of {options.episodes} episodes are solved'}")

@@ -1,4 +1,4 @@
-"""The progress bars of trainings."""
+"""The bars of several trainings, one after the other; a single one has `hindrl_jax.progress`."""
 
 from __future__ import annotations
 

@@ -24,13 +24,14 @@ from rich.table import Table
 from hindrl_jax import STARTED
 from hindrl_jax.checkpoints import Checkpoints
 from hindrl_jax.cli.common import console, counted, parse, peek, seeds_from
-from hindrl_jax.cli.progress import add_bar, advance, progress_bars
 from hindrl_jax.config import SWEEPABLE, TrainConfig, without_effect
 from hindrl_jax.datasets import load_demonstrations
 from hindrl_jax.errors import UserError, one_line
 from hindrl_jax.experiment import Diverged, Result, check_trainable, fit, record_demonstrations
 from hindrl_jax.presets import ORIGINAL_RULES, Preset, preset
+from hindrl_jax.progress import ProgressBar
 from hindrl_jax.registry import TASKS, checked, did_you_mean, make, task
+from hindrl_jax.reporters import REPORTERS, Reporter
 from hindrl_jax.runs import CHECKPOINTS, FROM_PYTHON, SUMMARY, SWEEP, RunSpec, RunWriter, SweepWriter, read_spec, read_sweep, summarise
 from hindrl_jax.types import Episodes
 
@@ -52,6 +53,10 @@ class TrainOptions:
     checkpoint_every: float = 60.0
     """Seconds between two checkpoints, which are also written at Ctrl-C and SIGTERM, and removed at the end; 0 writes none. Not with several
     hosts."""
+    tensorboard: bool = False
+    """Also write event files for TensorBoard, in the run's directory: all metrics for each seed, and their mean. Needs the package tensorboard."""
+    wandb: bool = False
+    """Also send all metrics to Weights & Biases, a run for each seed. Needs the package wandb; WANDB_MODE=offline needs no account."""
     distributed: bool = False
     """Share the seeds with other hosts: start the same command on each of them. The first one writes. Clusters that JAX knows (SLURM, Open
     MPI, Kubernetes, TPU) need nothing else; others need the three options below."""
@@ -80,6 +85,10 @@ class ResumeOptions:
     """Directory of the run or of the sweep."""
     checkpoint_every: float = TrainOptions.checkpoint_every
     """Seconds between two checkpoints; 0 writes none."""
+    tensorboard: bool = False
+    """Also write event files for TensorBoard, with what went before; without saying so where the run did before."""
+    wandb: bool = False
+    """Likewise for Weights & Biases, which gets new runs with what went before."""
 
 
 def train(arguments: list[str]) -> None:
@@ -89,16 +98,16 @@ def train(arguments: list[str]) -> None:
         out, spec = options.resume, read_spec(options.resume)
         if (out / SUMMARY).exists():
             raise UserError(f"{out} is finished, so there is nothing to resume: look at it with `hindrl eval {out}`")
-        writer = RunWriter(out, spec, resume=True)
+        writer = RunWriter(out, spec, resume=True, reporters=_reporters(options, out))
     else:
         spec, options = parse_train(arguments)
         out = options.out or _default_out(spec)
-        writer = RunWriter(out, spec, overwrite=options.overwrite)
+        writer = RunWriter(out, spec, overwrite=options.overwrite, reporters=_reporters(options))
     with contextlib.closing(writer), _hosts(options) as writes:
         result = _fit(spec, [spec.config], writer if writes else None, _checkpoints(out, options))
         if writes:
             summary = writer.finish(result)
-            console.print(_summary_table(summary))
+            console.print(_summary_table(summary, spec.config))
             console.print(_speed_line(summary))
             console.print(f"wrote {out}: {', '.join(writer.files())}")
 
@@ -110,12 +119,12 @@ def sweep(arguments: list[str]) -> None:
         out, (spec, settings) = options.resume, read_sweep(options.resume)
         if (out / SWEEP).exists():
             raise UserError(f"{out} is finished, so there is nothing to resume: look at {out / SWEEP}")
-        writer = SweepWriter(out, spec, settings, resume=True)
+        writer = SweepWriter(out, spec, settings, resume=True, reporters=_reporters(options, out))
     else:
         spec, options = parse_train(arguments, SweepOptions, "hindrl sweep")
         settings = list(_grid(options.over, spec.config))
         out = options.out or _default_out(spec, "sweep")
-        writer = checked(lambda: SweepWriter(out, spec, settings, overwrite=options.overwrite))
+        writer = checked(lambda: SweepWriter(out, spec, settings, overwrite=options.overwrite, reporters=_reporters(options)))
     with contextlib.closing(writer), _hosts(options) as writes:
         result = _fit(spec, [run.spec.config for run in writer.runs], writer if writes else None, _checkpoints(out, options))
         if writes:
@@ -150,6 +159,12 @@ def _sweep_table(rows: Sequence[dict[str, Any]], swept: Sequence[str]) -> Table:
             f"{row['worst_final_success']:.0%}",
         )
     return table
+
+
+def _reporters(options: TrainOptions | ResumeOptions, resumed: Path | None = None) -> list[type[Reporter]]:
+    """The kinds that are asked for, and those that the run or the sweep which is resumed had before."""
+    before = [] if resumed is None else [path.name for path in (*resumed.glob("*"), *resumed.glob("*/*"))]
+    return [kind for kind in REPORTERS if getattr(options, kind.folder) or kind.folder in before]
 
 
 def _default_out(spec: RunSpec, *words: str) -> Path:
@@ -221,36 +236,33 @@ def _fit(spec: RunSpec, configs: Sequence[TrainConfig], writer: RunWriter | Swee
         return fit(spec.env, demonstrations * len(configs), **runs)
     console.print(f"{spec.env.name}, {spec.config.algo}, {counted(demonstrations[0].lengths.shape[0], 'demonstration')}, {seeds}{settings}")
 
-    with progress_bars() as progress, _StopSignals() as stop_signals:
-        bar = add_bar(progress, spec.config)
-        began_at = 0
+    with ProgressBar(console=console) as progress, _StopSignals() as stop_signals:
+        progress.wait("compiling")
+        learning = False
 
         def begin(result: Result) -> None:
-            nonlocal began_at
             writer.start()
             if checkpoints is not None:
                 checkpoints.save_demonstrations(demonstrations)
-            began_at = result.steps_done
-            progress.console.print(f"compiled in {result.compile_seconds:.1f} s{_on_devices(result)}")
+            progress.say(f"compiled in {result.compile_seconds:.1f} s{_on_devices(result)}")
             if resumes:
-                progress.console.print(f"going on at step {began_at:,}" if began_at else "there is no checkpoint yet: beginning again")
+                progress.say(f"going on at step {result.steps_done:,}" if result.steps_done else "there is no checkpoint yet: beginning again")
             stop_signals.note()
 
         def report(result: Result) -> None:
-            rows_shown = len(configs) * writer.runs[0].rows_written
+            nonlocal learning
             if not writer.started:
                 begin(result)
-                rows_shown = len(result.rows)
-            elif progress.tasks[bar].completed == began_at:
-                progress.console.print(f"first updates after {time.perf_counter() - STARTED:.1f} s")
+            elif not learning:
+                learning = True
+                progress.say(f"first updates after {time.perf_counter() - STARTED:.1f} s")
             for index, run in enumerate(writer.runs):
                 run.report(result.rows_of(slice(index * num_seeds, (index + 1) * num_seeds)))
-            if result.rows[rows_shown:]:
-                progress.console.print(_evaluation_line(result.rows[rows_shown:]))
-            advance(progress, bar, result)
+            progress(result)
             if checkpoints is not None:
                 checkpoints.save_when_due(result)
             if stop_signals.received is not None and result.final_success is None:
+                progress.close()
                 _stop(result, stop_signals.received, writer, checkpoints)
 
         restore = {} if checkpoints is None else {"restore": checkpoints.restore}
@@ -305,8 +317,9 @@ def _on_devices(result: Result) -> str:
 
 
 def _speed_line(summary: dict[str, Any]) -> str:
+    env_steps = f" and {summary['env_steps_per_second']:,.0f} environment steps/s" if summary["env_steps_per_second"] else ""
     return (
-        f"{summary['updates_per_second']:,.0f} updates/s and {summary['env_steps_per_second']:,.0f} environment steps/s over all seeds, "
+        f"{summary['updates_per_second']:,.0f} updates/s{env_steps} over all seeds, "
         f"{summary['train_seconds']:.1f} s of training after {summary['compile_seconds']:.1f} s of compilation, "
         f"peak memory {summary['peak_memory_bytes'] / 2**20:,.0f} MiB"
     )
@@ -385,28 +398,18 @@ def _is_number(demos: str) -> bool:
     return re.fullmatch(r"[+-]?\d+", demos) is not None
 
 
-def _evaluation_line(rows: Sequence[Any]) -> str:
-    success = [row.success for row in rows]
-    spread = f" (worst {min(success):4.0%})" if len(rows) > 1 else ""
-    return (
-        f"{rows[0].env_steps:9,d} steps {rows[0].updates:8,d} updates {rows[0].seconds:7.1f} s   "
-        f"success {np.mean(success):4.0%}{spread}   length {np.mean([row.episode_length for row in rows]):5.1f}"
-    )
-
-
-def _summary_table(summary: dict[str, Any]) -> Table:
-    table = Table("seed", "final", "best", "length", "95% after", "updates", "seconds", box=box.SIMPLE_HEAD)
+def _summary_table(summary: dict[str, Any], config: TrainConfig) -> Table:
+    cloning = config.algo == "bc"  # which takes no environment steps
+    table = Table("seed", "final", "best", "length", "95% after", *([] if cloning else ["updates"]), "seconds", box=box.SIMPLE_HEAD)
     for column in table.columns:
         column.justify = "right"
     for seed in summary["seeds"]:
-        reached = seed["env_steps_to_95"] is not None
-        table.add_row(
-            str(seed["seed"]),
-            f"{seed['final_success']:.0%}",
-            f"{seed['best_success']:.0%}",
-            f"{seed['episode_length']:.1f}",
-            f"{seed['env_steps_to_95']:,} steps" if reached else "never",
-            f"{seed['updates_to_95']:,}" if reached else "",
-            f"{seed['seconds_to_95']:.1f}" if reached else "",
-        )
+        cells = [str(seed["seed"]), f"{seed['final_success']:.0%}", f"{seed['best_success']:.0%}", f"{seed['episode_length']:.1f}"]
+        if seed["updates_to_95"] is None:
+            cells.append("never")
+        else:
+            updates = f"{seed['updates_to_95']:,}"
+            cells += [f"{updates} updates"] if cloning else [f"{seed['env_steps_to_95']:,} steps", updates]
+            cells.append(f"{seed['seconds_to_95']:.1f}")
+        table.add_row(*cells)
     return table
