@@ -3,7 +3,10 @@ PYTHON ?= python3
 PIP = .venv/bin/python -m pip install -q --disable-pip-version-check
 PEERS_PIP = benchmarks/$(PIP) -r benchmarks/requirements-peers.txt
 
-.PHONY: train test test-slow lint bench clean
+INTEROP_PIP = tests/interop/$(PIP)
+TORCH = torch torchvision
+
+.PHONY: train test test-slow test-interop lint bench clean
 
 train: .venv/.installed  ## one demonstration, one seed, about a minute
 	.venv/bin/hindrl train --env FixedGridPickAndPlace --algo hindrl --demos 1 --seed 2 --out runs/quickstart --overwrite
@@ -14,6 +17,9 @@ test: .venv/.installed-test  ## two files at a time; more would need 5 GiB of me
 test-slow: .venv/.installed-test  ## the learning tests, which take minutes each
 	.venv/bin/python -m pytest -m slow
 
+test-interop: tests/interop/.venv/.installed  ## robomimic's own tools on our files, and ours on its files
+	tests/interop/.venv/bin/python -m pytest tests/interop
+
 lint: .venv/.installed-test
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
@@ -22,7 +28,7 @@ bench: .venv/.installed benchmarks/.venv/.installed  ## writes benchmarks/RESULT
 	.venv/bin/python -m benchmarks.run $(BENCH)
 
 clean:  ## everything that can be made again; results in runs/ stay
-	rm -rf .venv benchmarks/.venv build dist .pytest_cache .hypothesis .ruff_cache *.egg-info
+	rm -rf .venv benchmarks/.venv tests/interop/.venv build dist .pytest_cache .hypothesis .ruff_cache *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The stamp files say which lock was installed last, so that a second call installs nothing.
@@ -38,6 +44,16 @@ clean:  ## everything that can be made again; results in runs/ stay
 .venv/.installed-test: requirements-test.lock .venv/.installed
 	@echo "installing the tests' packages into .venv ..."
 	@$(PIP) -r requirements-test.lock
+	@touch $@
+
+# robomimic is installed without what it asks for: of that, its datasets and scripts need only these, and egl_probe has to be compiled.
+tests/interop/.venv/.installed: requirements-test.lock requirements.lock
+	@echo "installing robomimic and PyTorch into tests/interop/.venv ..."
+	@$(PYTHON) -m venv tests/interop/.venv
+	@$(INTEROP_PIP) -r requirements-test.lock
+	@$(INTEROP_PIP) $(TORCH) --extra-index-url https://download.pytorch.org/whl/cpu
+	@$(INTEROP_PIP) --no-deps robomimic==0.3.0 tensorboardX imageio
+	@$(INTEROP_PIP) --no-deps --no-build-isolation -e .
 	@touch $@
 
 # torch's CPU build is not on PyPI; pip may know a place that has it, else it is fetched from its makers.

@@ -125,8 +125,8 @@ def test_layout_is_that_of_robomimic(path):
         assert {data.attrs.get_id(name).dtype.kind for name in ("env", "env_args", "expert")} == {"S"}  # fixed length
         assert sorted(data) == ["demo_0", "demo_1", "demo_2"]
         env_args = json.loads(data.attrs["env_args"])
-        assert sorted(env_args) == ["env_kwargs", "env_name", "env_type"]
-        assert (env_args["env_name"], env_args["env_type"]) == ("LineWorld", 2)
+        assert sorted(env_args) == ["env_kwargs", "env_name", "type"]
+        assert (env_args["env_name"], env_args["type"]) == ("LineWorld", 2)
         assert env_args["env_kwargs"]["size"] == 10.0
         for i, length in enumerate((3, 6, 1)):
             demo = data[f"demo_{i}"]

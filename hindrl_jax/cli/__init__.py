@@ -23,7 +23,13 @@ COMMANDS: dict[str, Command | dict[str, Command]] = {
     "eval": playing.evaluate,
     "render": playing.render,
     "compare": comparison.compare,
-    "demos": {"record": demonstrations.record, "info": demonstrations.info, "plot": demonstrations.plot, "render": demonstrations.render},
+    "demos": {
+        "record": demonstrations.record,
+        "info": demonstrations.info,
+        "plot": demonstrations.plot,
+        "render": demonstrations.render,
+        "convert": demonstrations.convert,
+    },
     "reproduce": {"ablation": reproduction.ablate},
     "envs": environments.show,
 }

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,19 @@ from experts.by_hand import record_by_hand
 from experts.recording import on_host
 from experts.robosuite_arm import DeviceName
 from hindrl_jax.cli.common import console, counted, episode_key, parse, peek
-from hindrl_jax.datasets import DemonstrationSummary, check_can_write, describe_demonstrations, load_demonstrations, read_states, save_demonstrations
+from hindrl_jax.conversion import (
+    MINARI_PREFIX,
+    ForeignRecording,
+    Interpretation,
+    check_target,
+    left_out,
+    open_source,
+    read,
+    restore,
+    understand,
+    write,
+)
+from hindrl_jax.datasets import Recording, check_can_write, describe_demonstrations, padded, read_states, save_demonstrations, summarise_recording
 from hindrl_jax.errors import UserError
 from hindrl_jax.experiment import record_demonstrations
 from hindrl_jax.goals import epsilon_filter, epsilon_from_demonstrations, goal_table
@@ -95,10 +108,10 @@ def _record_by_hand(env: RestorableEnvironment, options: Record) -> tuple[Restor
 
 @dataclasses.dataclass(frozen=True)
 class Info:
-    """Say what a file of demonstrations holds."""
+    """Options of `hindrl demos info`."""
 
-    file: tyro.conf.Positional[Path]
-    """The HDF5 file."""
+    source: tyro.conf.Positional[str]
+    """The file, of hindrl_jax or another tool (.hdf5, .npz), or minari:NAME-v0."""
     m: int = 0
     """Distance in steps for epsilon (thesis eq. 4.7)."""
     k: float = 0.0
@@ -107,10 +120,46 @@ class Info:
 
 def info(arguments: list[str]) -> None:
     """Say what a file of demonstrations holds."""
-    options = parse(Info, arguments, "hindrl demos info")
-    summary, achieved, lengths, epsilon = _with_epsilon(options.file, m=options.m, k=options.k)
+    options, meaning, env = _parse_with_meaning(Info, arguments, "hindrl demos info", info.__doc__)
+    _check_epsilon(options.m, options.k)
+    found = open_source(options.source)
+    if isinstance(found, ForeignRecording):
+        _print_foreign(found)
+    try:
+        recording = understand(found, options.source, meaning, env)
+    except UserError as error:
+        if not isinstance(found, ForeignRecording) or meaning != Interpretation() or env is not None:
+            raise
+        console.print(f"not to be learned from as it is: {error}")
+        return
+    _print_recording(options, recording)
+
+
+def _print_foreign(found: ForeignRecording) -> None:
+    """What can be said before it is known which modality is what."""
+    demos = found.demonstrations
+    lengths = [len(demo.actions) for demo in demos]
+    console.print(
+        f"{found.source}: {found.format}, {found.env_name}, {counted(len(demos), 'demonstration')}, {sum(lengths)} transitions, "
+        f"lengths {min(lengths)} to {max(lengths)}, median {np.median(lengths):g}"
+    )
+    for key, names in found.filters.items():
+        console.print(f"filter key {key}: {counted(len(names), 'demonstration')}")
+    table = Table("modality", "numbers", "min", "max", box=box.SIMPLE_HEAD)
+    for key, width in found.shapes.items():
+        rows = [demo.modalities[key] for demo in demos if key in demo.modalities]
+        table.add_row(key, str(width), f"{min(row.min() for row in rows):.4g}", f"{max(row.max() for row in rows):.4g}")
+    actions = np.concatenate([demo.actions for demo in demos])
+    table.add_row("actions", str(actions.shape[1]), f"{actions.min():.4g}", f"{actions.max():.4g}")
+    console.print(table)
+
+
+def _print_recording(options: Info, recording: Recording) -> None:
+    summary = summarise_recording(options.source, recording)
+    achieved, lengths, epsilon = _goals(recording, m=options.m, k=options.k)
     filtered = goal_table(achieved, lengths, epsilon, filtered=True)
-    console.print(f"{options.file}: {summary.env_name}({', '.join(f'{name}={value}' for name, value in summary.env_kwargs.items())})")
+    arguments = ", ".join(f"{name}={value}" for name, value in summary.env_kwargs.items()) if summary.env_name in TASKS else "..."
+    console.print(f"{options.source}: {summary.env_name}({arguments})")
     console.print(
         f"{counted(summary.num_demonstrations, 'demonstration')}, {summary.num_solved} solved, {summary.num_transitions} transitions, "
         f"lengths {summary.length_min} to {summary.length_max}, median {summary.length_median:g}, "
@@ -118,20 +167,34 @@ def info(arguments: list[str]) -> None:
     )
     if summary.expert:
         console.print(f"expert: {', '.join(f'{name}={value}' for name, value in summary.expert.items())}")
+    if recording.converted_from:
+        console.print(f"converted from {recording.converted_from['format']}")
     console.print(f"the filter keeps {int(filtered.count)} of {int(jnp.sum(lengths + 1))} goals (m = {options.m}, k = {options.k:g})")
-    table = Table("goal dimension", "min", "max", "epsilon", box=box.SIMPLE_HEAD)
-    reached = np.concatenate([np.asarray(achieved[i, : int(length) + 1]) for i, length in enumerate(lengths)])
-    for index, row in enumerate(zip(reached.min(axis=0), reached.max(axis=0), epsilon, strict=True)):
-        table.add_row(str(index), *(f"{value:.4g}" for value in row))
+    reached = np.concatenate([demo.achieved_goals for demo in recording.demonstrations])
+    columns = {
+        "observation": _ranges(summary.observation_low, summary.observation_high),
+        "goal": _ranges(reached.min(axis=0), reached.max(axis=0)),
+        "epsilon": [f"{value:.3g}" for value in epsilon],
+        "action": _ranges(summary.action_low, summary.action_high),
+    }
+    table = Table("dim", *columns, box=box.SIMPLE_HEAD)
+    for column in table.columns:
+        column.no_wrap = True
+    for index, row in enumerate(itertools.zip_longest(*columns.values(), fillvalue="")):
+        table.add_row(str(index), *row)
     console.print(table)
+
+
+def _ranges(low: np.ndarray, high: np.ndarray) -> list[str]:
+    return [f"{least:.3g} to {most:.3g}" for least, most in zip(low, high, strict=True)]
 
 
 @dataclasses.dataclass(frozen=True)
 class PlotDemo:
-    """Draw what the epsilon filter keeps of a demonstration."""
+    """Options of `hindrl demos plot`."""
 
-    file: tyro.conf.Positional[Path]
-    """The HDF5 file."""
+    source: tyro.conf.Positional[str]
+    """The file, of hindrl_jax or another tool (.hdf5, .npz), or minari:NAME-v0."""
     to: Path | None = None
     """The .png file (default: the file's name with .png)."""
     demo: int = 0
@@ -146,18 +209,23 @@ class PlotDemo:
 
 def plot(arguments: list[str]) -> None:
     """Draw what the epsilon filter keeps of a demonstration."""
-    options = parse(PlotDemo, arguments, "hindrl demos plot")
-    path = options.to or options.file.with_suffix(".png")
+    options, meaning, env = _parse_with_meaning(PlotDemo, arguments, "hindrl demos plot", plot.__doc__)
+    here = options.source.rpartition("/")[2].removeprefix(MINARI_PREFIX) if options.source.startswith(MINARI_PREFIX) else options.source
+    path = options.to or Path(here).with_suffix(".png")
     if path.suffix != ".png":
         raise UserError(f"cannot draw {path.name}: the name must end in .png")
-    summary, achieved, lengths, epsilon = _with_epsilon(options.file, m=options.m, k=options.k)
-    _check_demo(options.demo, len(lengths), options.file)
-    goals = np.asarray(achieved[options.demo, : int(lengths[options.demo]) + 1])
+    _check_epsilon(options.m, options.k)
+    recording = read(options.source, meaning, env)
+    _check_demo(options.demo, len(recording.demonstrations), options.source)
+    goals = recording.demonstrations[options.demo].achieved_goals
+    if goals.shape[1] < 2:
+        raise UserError(f"{options.source}: its goals have one dimension, and the picture takes two; give more --achieved-goal-keys")
     dims = options.dims or tuple(sorted(int(dim) for dim in np.argsort(-np.ptp(_continuous(goals), axis=0), kind="stable")[:2]))
     if len(set(dims)) < 2 or not all(0 <= dim < goals.shape[1] for dim in dims):
         raise UserError(f"--dims {dims[0]} {dims[1]} is not usable: give two different numbers from 0 to {goals.shape[1] - 1}")
-    kept = np.asarray(epsilon_filter(goals, epsilon))
-    title = f"{summary.env_name}, demonstration {options.demo}, m = {options.m}, k = {options.k:g}"
+    _, _, epsilon = _goals(recording, m=options.m, k=options.k)
+    kept = np.asarray(epsilon_filter(jnp.asarray(goals, jnp.float32), epsilon))
+    title = f"{recording.env_name}, demonstration {options.demo}, m = {options.m}, k = {options.k:g}"
     with disk_trouble(path):
         save_filter(goals, kept, np.asarray(epsilon), path, dims=dims, title=title)
     console.print(f"wrote {path}: the filter keeps {kept.sum()} of {len(kept)} goals")
@@ -169,18 +237,75 @@ def _continuous(goals: np.ndarray) -> np.ndarray:
     return goals if whole.all() else np.where(whole[None], 0.0, goals)
 
 
-def _with_epsilon(file: Path, *, m: int, k: float) -> tuple[DemonstrationSummary, jax.Array, jax.Array, jax.Array]:
-    """What a file holds, the goals (N, T + 1, G) that its demonstrations achieved, their lengths (N,), and epsilon (G,) over all of them."""
+def _goals(recording: Recording, *, m: int, k: float) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The goals (N, T + 1, G) that the demonstrations achieved, their lengths (N,), and epsilon (G,) over all of them."""
+    demos = recording.demonstrations
+    lengths = jnp.asarray([len(demo) for demo in demos])
+    achieved = jnp.asarray(padded([demo.achieved_goals for demo in demos], max(len(demo) for demo in demos) + 1))
+    return achieved, lengths, epsilon_from_demonstrations(achieved, lengths, m=m, k=k)
+
+
+def _check_epsilon(m: int, k: float) -> None:
     if m < 0 or k < 0:
         raise UserError(f"--m {m} --k {k} is not usable: both must be 0 or more")
-    summary = describe_demonstrations(file)
-    env = make(summary.env_name, **summary.env_kwargs)
-    episodes = load_demonstrations(file, env)
-    achieved, lengths = env.achieved_goal(jnp.asarray(episodes.observations)), jnp.asarray(episodes.lengths)
-    return summary, achieved, lengths, epsilon_from_demonstrations(achieved, lengths, m=m, k=k)
 
 
-def _check_demo(demo: int, num_demos: int, file: Path) -> None:
+def _parse_with_meaning(
+    options_class: type[Any], arguments: list[str], program: str, description: str | None
+) -> tuple[Any, Interpretation, RestorableEnvironment | None]:
+    """The options of a command that reads files of any tool: its own, what the modalities mean, and the environment, if one is named."""
+    name = peek(arguments, "env")
+    fields: list[tuple[str, Any, Any]] = [
+        ("options", options_class, dataclasses.MISSING),
+        ("meaning", Interpretation, Interpretation()),
+        (
+            "env",
+            Annotated[Literal[tuple(TASKS)] | None, tyro.conf.arg(help="The environment, if it is one of ours and the file does not say so.")],
+            None,
+        ),
+    ]
+    if name is not None:
+        fields.append(("environment", task(name).environment, task(name).environment()))
+    namespace = dataclasses.make_dataclass(
+        "Options", [(field, kind) if default is dataclasses.MISSING else (field, kind, default) for field, kind, default in fields], frozen=True
+    )
+    parsed = parse(namespace, arguments, program, description)
+    return parsed.options, parsed.meaning, getattr(parsed, "environment", None)
+
+
+@dataclasses.dataclass(frozen=True)
+class Convert:
+    """Options of `hindrl demos convert`."""
+
+    source: tyro.conf.Positional[str]
+    """A file of hindrl_jax, robomimic or robosuite (.hdf5), an archive (.npz), or minari:NAME-v0."""
+    target: tyro.conf.Positional[str]
+    """What to write: NAME.hdf5 (a file of hindrl_jax, which robomimic can read too), NAME.npz, or minari:NAME-v0."""
+    overwrite: bool = False
+    """Replace what is already there."""
+    restore: bool = False
+    """Write the robomimic file that the source was once converted from, without what the conversion added."""
+
+
+def convert(arguments: list[str]) -> None:
+    """Convert demonstrations from and to robomimic, Minari and npz."""
+    options, meaning, env = _parse_with_meaning(Convert, arguments, "hindrl demos convert", convert.__doc__)
+    check_target(options.target, overwrite=options.overwrite)
+    recording = read(options.source, meaning, env)
+    if options.restore:
+        restore(options.target, recording, source=options.source, overwrite=options.overwrite)
+    else:
+        write(options.target, recording, overwrite=options.overwrite)
+    summary = summarise_recording(options.source, recording)
+    console.print(
+        f"wrote {options.target}: {counted(summary.num_demonstrations, 'demonstration')} of {summary.env_name}, {summary.num_solved} solved, "
+        f"{summary.num_transitions} transitions"
+    )
+    for line in left_out(options.target, recording):
+        console.print(line)
+
+
+def _check_demo(demo: int, num_demos: int, file: Path | str) -> None:
     if not 0 <= demo < num_demos:
         raise UserError(f"{file} has no demonstration {demo}: choose one from 0 to {num_demos - 1}")
 

@@ -25,7 +25,7 @@ from hindrl_jax import STARTED
 from hindrl_jax.checkpoints import Checkpoints
 from hindrl_jax.cli.common import console, counted, parse, peek, seeds_from
 from hindrl_jax.config import SWEEPABLE, TrainConfig, without_effect
-from hindrl_jax.datasets import load_demonstrations
+from hindrl_jax.conversion import MINARI_PREFIX, load
 from hindrl_jax.errors import UserError, one_line
 from hindrl_jax.experiment import Diverged, Result, check_trainable, fit, record_demonstrations
 from hindrl_jax.presets import ORIGINAL_RULES, Preset, preset
@@ -41,7 +41,7 @@ class TrainOptions:
     """Options of `hindrl train` and `hindrl sweep` that belong to the run as a whole."""
 
     demos: str = "1"
-    """Demonstrations: a number to record with the task's expert for each seed, or an HDF5 file that all seeds share."""
+    """Demonstrations: a number to record with the task's expert for each seed, or a file (.hdf5, .npz) or minari:NAME-v0 that all seeds share."""
     seeds: int | None = None
     """Number of seeds trained side by side (default: 1)."""
     seed: int | None = None
@@ -364,7 +364,9 @@ def parse_train(arguments: list[str], options_class: type[TrainOptions] = TrainO
         if count < 1:
             raise UserError(f"--seeds {count} is too few: train at least 1 seed")
         seeds = seeds_from(count, first)
-    demos = options.demos if _is_number(options.demos) or options.demos == FROM_PYTHON else str(Path(options.demos).absolute())
+    demos = options.demos
+    if not (_is_number(demos) or demos == FROM_PYTHON or demos.startswith(MINARI_PREFIX)):
+        demos = str(Path(demos).absolute())
     return RunSpec(env=parsed.environment, config=parsed.training, demos=demos, seeds=seeds), options
 
 
@@ -384,7 +386,7 @@ def demonstrations_of(spec: RunSpec) -> list[Episodes]:
         raise UserError("the demonstrations of this run were given from Python, not from a file: name others with --demos")
     if _is_number(spec.demos):
         return [record_demonstrations(spec.env, int(spec.demos), seed=seed) for seed in spec.seeds]
-    episodes = load_demonstrations(spec.demos, spec.env)
+    episodes = load(spec.demos, spec.env)
     solved = np.asarray(episodes.terminated)
     if not solved.any():
         raise UserError(f"{spec.demos}: none of its demonstrations solves the task, so there is no goal to learn: record others")
