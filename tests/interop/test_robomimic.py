@@ -14,6 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hindrl_jax import cli
+from hindrl_jax.datasets import load_demonstrations, read_recording
+from hindrl_jax.registry import make
+
 pytest.importorskip("robomimic", reason="robomimic is not installed: make test-interop")
 pytestmark = pytest.mark.filterwarnings("ignore")  # robomimic and what it imports are of another time
 with warnings.catch_warnings():
@@ -22,10 +26,6 @@ with warnings.catch_warnings():
     from robomimic.scripts import get_dataset_info, playback_dataset
     from robomimic.utils import obs_utils
     from robomimic.utils.dataset import SequenceDataset
-
-import hindrl_jax.cli as cli
-from hindrl_jax.datasets import load_demonstrations, read_recording
-from hindrl_jax.registry import make
 
 ROBOMIMIC_FILE = Path(__file__).parent.parent / "data" / "robomimic_low_dim.hdf5"
 GOAL_KEYS = ["observation", "achieved_goal", "desired_goal"]
