@@ -378,7 +378,9 @@ def test_minari_dataset_loads_trains_and_comes_back(collected, recorded, env, tm
         np.testing.assert_array_equal(demo.actions, original.actions)
         np.testing.assert_array_equal(demo.rewards, original.rewards)
         np.testing.assert_array_equal(demo.desired_goal, env.task_goal())
-    cli.main(["train", "--demos", "minari:grid/collected-v0", "--out", str(tmp_path / "run"), "--demo-reset-ratio", "0", *TINY])
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        cli.main(["train", "--demos", "minari:grid/collected-v0", "--out", str(tmp_path / "run"), "--demo-reset-ratio", "0", *TINY])
     assert "dropped 1 of 3 demonstrations that do not solve" in capsys.readouterr().err
     assert (tmp_path / "run" / "summary.json").exists()
     ours = tmp_path / "ours.hdf5"
