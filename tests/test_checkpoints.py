@@ -343,7 +343,7 @@ def test_a_sweep_that_was_stopped_is_resumed(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_twenty_runs_killed_at_random_moments_end_as_if_they_never_were(tmp_path):
-    train = (*TRAIN, "--steps", 30_000, "--eval-every", 2_000)
+    train = (*TRAIN, "--steps", 6_000, "--eval-every", 2_000)
     run(*train, "--out", tmp_path / "first")  # fills the cache of compiled programs, so that the next one takes as long as those after it
     started = time.perf_counter()
     run(*train, "--out", tmp_path / "whole", "--checkpoint-every", 0.001)
