@@ -303,6 +303,9 @@ class TrainConfig:
     pretrain_updates: int = 0
     """Gradient steps of actor and critics on demonstrations alone, after the warm start and before the first on mixed batches (DQfD, Hester et
     al., 2018; DDPGfD, Vecerik et al., 2017)."""
+    agent_resets: tuple[float, ...] = ()
+    """Shares of the run, in order, after which networks, optimisers and their schedules begin anew, while the replay stays (Nikishin et al., The
+    primacy bias in deep reinforcement learning, 2022)."""
     buffer_size: int = 500_000
     """Transitions that the replay holds."""
     eval_every: int = 4_000
@@ -323,6 +326,10 @@ class TrainConfig:
             demo_reset_ratio=(0.0 <= self.demo_reset_ratio <= 1.0, "between 0 and 1"),
             demo_reset_curriculum=(0.0 <= self.demo_reset_curriculum <= 1.0, "between 0 and 1"),
             bc_warm_start=(self.bc_warm_start >= 0, "0 or more"),
+            agent_resets=(
+                all(0.0 < share < 1.0 for share in self.agent_resets) and sorted(set(self.agent_resets)) == list(self.agent_resets),
+                "shares between 0 and 1, each larger than the one before",
+            ),
             pretrain_updates=(self.pretrain_updates >= 0, "0 or more"),
         )
         if self.demo_reset_curriculum > 0.0 and self.demo_reset_ratio == 0.0:
@@ -387,8 +394,8 @@ _CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
         "demo_returns terminate_on_relabel bound_by_obtained_return timeouts_are_terminal importance_exponent demo_priority_bonus "
         "achieved_goal_ratio final_achieved_goal_ratio clip_targets num_critics num_target_critics num_quantiles top_quantiles_to_drop_per_net "
         "layer_norm target_update_rate initial_alpha target_entropy final_target_entropy actor_delay exploration_noise target_noise "
-        "target_noise_clip normalise_value bc_weight final_bc_weight num_envs updates_per_iteration learning_starts buffer_size demo_reset_ratio "
-        "demo_reset_curriculum",
+        "target_noise_clip normalise_value bc_weight final_bc_weight agent_resets num_envs updates_per_iteration learning_starts buffer_size "
+        "demo_reset_ratio demo_reset_curriculum",
         lambda config: config.algo != "bc",
         "behaviour cloning does not use it: choose another algo",
     ),

@@ -49,6 +49,8 @@ class TrainState:
     key: Array
     env_steps: Array  # () int32
     updates: Array  # () int32
+    resets: Array  # () int32 times that the agent began anew
+    updates_at_reset: Array  # () int32 updates when it last did, or 0
 
 
 def guidance(demonstrations: Episodes, env: Environment, config: TrainConfig) -> Guidance:
@@ -105,7 +107,7 @@ def init(key: Array, data: Guidance, env: Environment, config: TrainConfig) -> T
       UserError: if the replay is too small.
     """
     key_agent, key_rollout, key_train = jax.random.split(key, 3)
-    dims = dict(observation_dim=env.observation_dim, goal_dim=env.goal_dim, action_dim=env.action_dim)
+    dims = _dims(env)
     smallest = 2 * config.num_envs * env.horizon
     empty = replay.init(
         num_envs=config.num_envs,
@@ -123,7 +125,13 @@ def init(key: Array, data: Guidance, env: Environment, config: TrainConfig) -> T
         key=key_train,
         env_steps=jnp.asarray(0),
         updates=jnp.asarray(0),
+        resets=jnp.asarray(0),
+        updates_at_reset=jnp.asarray(0),
     )
+
+
+def _dims(env: Environment) -> dict[str, int]:
+    return dict(observation_dim=env.observation_dim, goal_dim=env.goal_dim, action_dim=env.action_dim)
 
 
 def _uses_intersections(config: TrainConfig) -> bool:
@@ -153,6 +161,28 @@ def _with_achieved_goals(
 def _progress(state: TrainState, config: TrainConfig) -> Array:
     """() share of the run that is over."""
     return jnp.minimum(state.env_steps / config.steps, 1.0)
+
+
+def _agent_schedule(state: TrainState, config: TrainConfig, updates: Array, env: Environment) -> agents.Schedule:
+    """What holds for the agent at that number of updates: its schedules span the time between two resets."""
+    begins, ends = (jnp.asarray(shares)[state.resets] for shares in ((0.0, *config.agent_resets), (*config.agent_resets, 1.0)))
+    progress = jnp.clip((_progress(state, config) - begins) / (ends - begins), 0.0, 1.0) if config.agent_resets else _progress(state, config)
+    return agents.schedule(progress, updates - state.updates_at_reset, config.agent, action_dim=env.action_dim)
+
+
+def _reset_agent_if_due(state: TrainState, env: Environment, config: TrainConfig) -> TrainState:
+    """The agent begins anew, and all else stays, at the first call after each share of the run in `agent_resets`."""
+    if not config.agent_resets:
+        return state
+    passed = jnp.sum(_progress(state, config) >= jnp.asarray(config.agent_resets))
+    key, key_agent = jax.random.split(state.key)
+    due, anew = passed > state.resets, agents.init(key_agent, config.agent, **_dims(env))
+    return state.replace(
+        agent=tree_where(due, anew, state.agent),
+        key=key,
+        resets=passed,
+        updates_at_reset=jnp.where(due, state.updates, state.updates_at_reset),
+    )
 
 
 def warm_up_iterations(env: Environment, config: TrainConfig) -> int:
@@ -248,7 +278,7 @@ def learn(state: TrainState, data: Guidance, *, env: Environment, config: TrainC
         batches = jax.vmap(draw)(jax.random.split(key_batch, config.updates_per_iteration))
         return _gradient_steps(key_updates, state, batches, data, env, config)
 
-    state, metrics = jax.lax.scan(iteration, state, length=num_iterations)
+    state, metrics = jax.lax.scan(iteration, _reset_agent_if_due(state, env, config), length=num_iterations)
     return state, jax.tree.map(jnp.mean, metrics)
 
 
@@ -256,12 +286,12 @@ def _gradient_steps(
     key: Array, state: TrainState, batches: Transition, data: Guidance, env: Environment, config: TrainConfig
 ) -> tuple[TrainState, Metrics]:
     """One gradient step for each of the batches, leaves (number, B, ...), and their mean metrics."""
-    num_updates, progress = batches.reward.shape[0], _progress(state, config)
+    num_updates = batches.reward.shape[0]
 
     def gradient_step(carry: tuple[Array, AgentState], update: tuple[Array, Transition]) -> tuple[tuple[Array, AgentState], Metrics]:
         (key, agent), (index, batch) = carry, update
         key, key_update = jax.random.split(key)
-        schedule = agents.schedule(progress, state.updates + index, config.agent, action_dim=env.action_dim)
+        schedule = _agent_schedule(state, config, state.updates + index, env)
         inputs = _network_inputs(batch, data.scale, env, config)
         agent, metrics = agents.update(key_update, agent, batch, **inputs, schedule=schedule, config=config.agent)
         shares = {"batch/relabelled": jnp.mean(batch.is_relabelled), "batch/demonstrations": jnp.mean(batch.is_demonstration)}

@@ -691,3 +691,28 @@ def test_with_span_1_the_averaged_actor_is_the_mean_of_all_actors(data):
     chex.assert_trees_all_close(state.agent.average_actor, mean, atol=1e-6)
     chex.assert_trees_all_close(actors[0], actors[3], atol=0.1)
     assert np.abs(mean["params"]["Dense_0"]["kernel"] - actors[3]["params"]["Dense_0"]["kernel"]).max() > 1e-4
+
+
+def test_the_agent_begins_anew_once_and_the_replay_stays(data):
+    """A reset halfway, at step 51: collecting takes 42 steps, each call of `learn` 9 more and 6 updates."""
+    config = make_config(agent_resets=(0.5,))
+    run = jax.jit(functools.partial(train.learn, env=make_env(), config=config, num_iterations=LEARN_STEPS), compiler_options=FAST_COMPILATION)
+    steps, states = [], [collected(0, data)]
+    for _ in range(3):
+        state, metrics = run(states[-1], data)
+        states.append(state)
+        steps.append((int(state.env_steps), int(state.resets), int(state.updates_at_reset), int(state.agent.actor_optimiser.count)))
+    # The second call begins at step 51, so its 6 updates are the first ones of the new agent; the third goes on with it.
+    assert steps == [(51, 0, 0, 6), (60, 1, 6, 6), (69, 1, 6, 12)]
+    assert [int(state.updates) for state in states[1:]] == [6, 12, 18]
+    assert (np.asarray(states[3].replay.num_complete) >= np.asarray(states[1].replay.num_complete)).all()
+    assert np.asarray(states[3].replay.num_complete).sum() > 0
+    # Schedules span the time between resets: at step 60 a sixth of 51 steps or less is over, and the target entropy rises from -1000 to 1000.
+    never = make_config()
+    before = train._agent_schedule(states[2], never, states[2].updates, make_env())
+    after = train._agent_schedule(states[2], config, states[2].updates, make_env())
+    np.testing.assert_allclose(before.target_entropy, -1000.0 + 2000.0 * 60 / 102, rtol=1e-6)
+    np.testing.assert_allclose(after.target_entropy, -1000.0 + 2000.0 * (60 - 51) / 51, rtol=1e-6)
+    np.testing.assert_allclose(after.actor_average_rate, min(config.agent.actor_average_rate, 1.0 / (1.0 + 0.25 * 6)), rtol=1e-6)
+    first = train._agent_schedule(states[0], config, states[0].updates, make_env())
+    np.testing.assert_allclose(first.target_entropy, -1000.0 + 2000.0 * 42 / 51, rtol=1e-6)
