@@ -40,6 +40,9 @@ _EXPORTS = {
 __all__ = ["__version__", *_EXPORTS]
 
 
+importlib.import_module("hindrl_jax.registration").register()  # so that `gymnasium.make("hindrl/...")` finds our environments
+
+
 def __getattr__(name: str) -> Any:
     if name in _EXPORTS:
         return getattr(importlib.import_module(_EXPORTS[name]), name)
