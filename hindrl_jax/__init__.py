@@ -33,6 +33,7 @@ _EXPORTS = {
     "make": "hindrl_jax.registry",
     "preset": "hindrl_jax.presets",
     "record_demonstrations": "hindrl_jax.experiment",
+    "record_gymnasium": "hindrl_jax.host",
     "save_demonstrations": "hindrl_jax.datasets",
     "save_run": "hindrl_jax.runs",
 }
