@@ -27,7 +27,7 @@ from hindrl_jax.errors import UserError
 from hindrl_jax.from_gymnasium import GymnasiumEnv, Outcome, Simulators
 from hindrl_jax.rollout import Evaluation, RolloutState
 from hindrl_jax.train import Guidance, TrainState
-from hindrl_jax.types import Array, Episodes, TimeStep, action_from_env, action_to_env
+from hindrl_jax.types import Array, Episodes, TimeStep, action_from_env, action_to_env, compiler_options
 
 FRESH_EPISODES = 100
 """By which a finished run is judged."""
@@ -125,7 +125,7 @@ class HostPrograms:
             def compiled(function: Callable[..., Any], *arguments: Any, donate: bool = False) -> tuple[Any, Any]:
                 """The program, still to come, and the shapes of what it returns."""
                 traced = jax.jit(over_seeds(function, self.mesh), donate_argnums=0 if donate else ()).trace(*arguments)
-                return pool.submit(traced.lower().compile), shapes_on(traced.out_info, self.mesh)
+                return pool.submit(traced.lower().compile, compiler_options(env)), shapes_on(traced.out_info, self.mesh)
 
             values = shapes_on(self.values, self.mesh)
             seeds = jax.ShapeDtypeStruct(self._shape[:1], np.uint32)
