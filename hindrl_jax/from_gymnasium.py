@@ -17,7 +17,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import importlib
 import json
+import os
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -25,7 +27,7 @@ from gymnasium.spaces import Box, Dict
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 from hindrl_jax.checks import check, check_types
-from hindrl_jax.errors import UserError
+from hindrl_jax.errors import UserError, one_line
 from hindrl_jax.registration import check_registered, make_single
 from hindrl_jax.types import Array
 
@@ -236,6 +238,9 @@ class Simulators:
 
     def __init__(self, env: GymnasiumEnv, num_envs: int, *, render_mode: str | None = None):
         self.env, self.num_envs = env, num_envs
+        if render_mode is not None and not os.environ.get("MUJOCO_GL"):
+            # Else Gymnasium would try one library after the other, and the first failure spoils the next.
+            os.environ["MUJOCO_GL"] = importlib.import_module("envs.reach.viewer").opengl_library()
         make = functools.partial(make_single, env.id, env.arguments, env.horizon, render_mode)
         mode = dict(autoreset_mode=AutoresetMode.DISABLED)  # an episode that has reached its goal is to end, though its environment does not say so
         if env.vectorization == "async":
@@ -281,8 +286,21 @@ class Simulators:
         )
 
     def picture(self) -> np.ndarray:
-        """A picture (H, W, 3) uint8 of the first environment."""
-        return self._envs.render()[0]
+        """A picture (H, W, 3) uint8 of the first environment.
+
+        Raises:
+          UserError: if it draws none, or cannot draw here.
+        """
+        try:
+            picture = np.asarray(self._envs.render()[0])
+        except Exception as error:  # the libraries fail in many ways
+            raise UserError(
+                f"{self.env.name} cannot be drawn ({one_line(error)}): if that is for want of OpenGL, install libegl1 or libosmesa6, or set "
+                "MUJOCO_GL=egl, osmesa or glfw"
+            ) from error
+        if picture.ndim != 3:
+            raise UserError(f"{self.env.name} draws no pictures: it has no render mode rgb_array")
+        return picture
 
     def close(self) -> None:
         """Ends the environments, and their processes if they have some."""

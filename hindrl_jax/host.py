@@ -76,18 +76,19 @@ class HostPrograms:
         if jax.process_count() > 1:
             raise UserError(f"{env.name} is stepped by one host only: drop --distributed")
         self.env, self.config, self.values, self.chunk, self.warm_up = env, configs[0], values, chunk, warm_up
-        self.mesh = seed_mesh(len(configs))
+        self.mesh, self.steps_at_random = seed_mesh(len(configs)), warm_up * self.config.num_envs
         self._shape = (len(configs), self.config.num_envs)
         self._act = Policies(env, self.config, self.mesh, stochastic=False)
         self._compile(demonstrations)
         num_envs = len(configs) * self.config.num_envs
+        # They end when they are no longer referred to, so the compiled functions above must not refer to this object.
         self._fresh = Simulators(env, num_envs)  # for evaluations
         self._lived = None if self.config.algo == "bc" else Simulators(env, num_envs)
         self._begun = False  # whether the state's episodes are those of `_lived`
 
     def _compile(self, demonstrations: Episodes) -> None:
         """Traces everything from shapes; each program is compiled while the next one is being traced."""
-        env, config, cloning = self.env, self.config, self.config.algo == "bc"
+        env, config, chunk, cloning = self.env, self.config, self.chunk, self.config.algo == "bc"
 
         def start(seed: Array, demonstrations: Episodes, begun: RolloutState, values: dict[str, Array]) -> tuple[Guidance, TrainState, Array]:
             actual = with_traced_values(config, values)
@@ -118,7 +119,7 @@ class HostPrograms:
             return training.pretrain(state, guidance, env=env, config=with_traced_values(config, values))
 
         def clone(state: TrainState, guidance: Guidance, values: dict[str, Array]) -> tuple[TrainState, Metrics]:
-            return training.clone(state, guidance, env=env, config=with_traced_values(config, values), num_iterations=self.chunk)
+            return training.clone(state, guidance, env=env, config=with_traced_values(config, values), num_iterations=chunk)
 
         with ThreadPoolExecutor() as pool:
 
@@ -190,12 +191,6 @@ class HostPrograms:
     def evaluate_fresh(self, key: Array, actor: Any, guidance: Guidance, values: dict[str, Array]) -> tuple[Array, Evaluation]:
         """Plays the episodes by which a finished run is judged."""
         return self._evaluated(key, actor, guidance, FRESH_EPISODES)
-
-    def close(self) -> None:
-        """Ends the environments."""
-        for simulators in (self._fresh, self._lived):
-            if simulators is not None:
-                simulators.close()
 
     def _evaluated(self, key: Array, actor: Any, guidance: Guidance, num_episodes: int) -> tuple[Array, Evaluation]:
         both = jax.vmap(jax.random.split)(key)

@@ -6,9 +6,10 @@ process that steps an environment, and must import nothing but Gymnasium. `hindr
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import importlib
-import logging
+import io
 from typing import Any
 
 import gymnasium
@@ -16,6 +17,7 @@ import gymnasium
 from hindrl_jax.errors import UserError, one_line
 
 NAMESPACE = "hindrl"
+ROBOTICS = "gymnasium_robotics"
 MAX_EPISODE_STEPS = {
     "GridPickAndPlace": 100,
     "FixedGridPickAndPlace": 100,
@@ -50,14 +52,14 @@ def check_registered(gymnasium_id: str) -> None:
       UserError: if it is not.
     """
     module, _, env_id = gymnasium_id.rpartition(":")
-    try:
-        if module:
-            importlib.import_module(module)
-        elif env_id not in gymnasium.registry:
-            _import_robotics()
-    except ImportError as error:
-        if module:
-            raise UserError(f"{gymnasium_id}: {module} cannot be imported ({one_line(error)}): install it, or mend the name") from error
+    if module or env_id not in gymnasium.registry:
+        try:
+            with contextlib.redirect_stderr(io.StringIO()):  # gymnasium-robotics prints news of some of its environments, whichever one wants
+                importlib.import_module(module or ROBOTICS)
+        except Exception as error:  # packages that load a simulator fail in many ways
+            if module or not (isinstance(error, ModuleNotFoundError) and error.name == ROBOTICS):
+                name = module or ROBOTICS
+                raise UserError(f"{gymnasium_id}: {name} cannot be imported ({one_line(error)}): install it, or mend what it complains of") from error
     if env_id not in gymnasium.registry:
         close = difflib.get_close_matches(env_id, list(gymnasium.registry), n=1)
         hint = f" (did you mean {close[0]!r}?)" if close else ""
@@ -65,14 +67,6 @@ def check_registered(gymnasium_id: str) -> None:
             f"Gymnasium knows no environment {env_id!r}{hint}: install the package that has it (gymnasium-robotics for Fetch tasks, hands and "
             "mazes), or name that package's module, as in gymnasium:MODULE:ID"
         )
-
-
-def _import_robotics() -> None:
-    logging.disable(logging.WARNING)  # it warns of old versions, whichever version one wants
-    try:
-        importlib.import_module("gymnasium_robotics")
-    finally:
-        logging.disable(logging.NOTSET)
 
 
 def make_single(gymnasium_id: str, arguments: dict[str, Any], max_episode_steps: int | None, render_mode: str | None = None) -> gymnasium.Env:
