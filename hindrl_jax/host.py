@@ -83,8 +83,8 @@ class HostPrograms:
         num_envs = len(configs) * self.config.num_envs
         # They end when they are no longer referred to, so the compiled functions above must not refer to this object.
         self._fresh = Simulators(env, num_envs)  # for evaluations
-        self._lived = None if self.config.algo == "bc" else Simulators(env, num_envs)
-        self._begun = False  # whether the state's episodes are those of `_lived`
+        self.simulators = None if self.config.algo == "bc" else Simulators(env, num_envs)
+        self._begun = False  # whether the state's episodes are those of `simulators`
 
     def _compile(self, demonstrations: Episodes) -> None:
         """Traces everything from shapes; each program is compiled while the next one is being traced."""
@@ -158,7 +158,7 @@ class HostPrograms:
     def start(self, seeds: Array, demonstrations: Episodes, values: dict[str, Array]) -> tuple[Guidance, TrainState, Array]:
         """What a run begins with: the guidance, the state with its first episodes, and keys for evaluations."""
         observation, goal = (np.zeros((*self._shape, dim), np.float32) for dim in (self.env.observation_dim, self.env.goal_dim))
-        if self._lived is not None:
+        if self.simulators is not None:
             seeds_of_each = [np.random.SeedSequence(int(seed)).generate_state(self._shape[1]) for seed in np.asarray(seeds)]
             observation, goal = self._begin(np.concatenate(seeds_of_each))
         return self._start(seeds, demonstrations, self._put(_episodes(observation, goal)), values)
@@ -172,7 +172,7 @@ class HostPrograms:
 
     def learn(self, state: TrainState, guidance: Guidance, values: dict[str, Array]) -> tuple[TrainState, Metrics]:
         """As `train.learn` or, for bc, `train.clone`, for `chunk` iterations."""
-        if self._lived is None:
+        if self.simulators is None:
             return self._programs["clone"](state, guidance, values)
         if not self._begun:
             state = self._with_new_episodes(state)
@@ -202,7 +202,7 @@ class HostPrograms:
 
     def _live(self, state: TrainState, plan: Plan, guidance: Guidance, values: dict[str, Array]) -> TrainState:
         """Takes the planned step in all environments and remembers it."""
-        outcome = self._lived.step(np.asarray(plan.env_action).reshape(-1, self.env.action_dim))
+        outcome = self.simulators.step(np.asarray(plan.env_action).reshape(-1, self.env.action_dim))
         return self._programs["remember"](state, plan, *self._put(self._told(outcome)), guidance, values)
 
     def _told(self, outcome: Outcome) -> tuple[TimeStep, RolloutState]:
@@ -213,7 +213,7 @@ class HostPrograms:
     def _begin(self, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Begins an episode in each environment: seeds (S * E,) -> observations (S, E, D), desired goals (S, E, G)."""
         self._begun = True
-        return self._by_seed(self._lived.begin(seeds))
+        return self._by_seed(self.simulators.begin(seeds))
 
     def _with_new_episodes(self, state: TrainState) -> TrainState:
         """The state of a run that goes on from a checkpoint, where nobody knows how its environments stood: their episodes are lost."""
