@@ -1,20 +1,22 @@
-"""TQC with hindsight experience replay, of Stable-Baselines3, on our environments as Gymnasium registers them.
+"""TQC with hindsight experience replay, as Stable-Baselines3 has it, on our environments as Gymnasium registers them.
 
-python examples/sb3_her_tqc.py                                                  # one object on a 5 x 5 grid, minutes
+python examples/sb3_her_tqc.py                                                  # one object on a 4 x 4 grid
+python examples/sb3_her_tqc.py --learner sbx                                    # the same with SBX
 python examples/sb3_her_tqc.py --num-objects 2 --size 10 --steps 200000         # the default task
 
-It needs `pip install sb3-contrib`, or `make bench` to have installed it: benchmarks/.venv/bin/python examples/sb3_her_tqc.py. Nothing here is ours
-but the environment. `--learner sbx` trains the same with SBX, which has no HER, so from the environment's reward alone.
+Nothing here is ours but the environment. It needs `pip install sb3-contrib` or sbx-rl; or, where `make bench` has installed them, it is run by
+`PYTHONPATH=. benchmarks/.venv/bin/python`.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib
 import time
 
 import gymnasium
-from sb3_contrib import TQC
 from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv
@@ -22,7 +24,7 @@ from stable_baselines3.common.vec_env import VecEnv
 import hindrl_jax  # noqa: F401, registers the environments
 
 
-def success_rate(model: TQC, envs: VecEnv, episodes: int) -> float:
+def success_rate(model: BaseAlgorithm, envs: VecEnv, episodes: int) -> float:
     """Share of fresh episodes that the policy's mean actions solve."""
     solved: list[bool] = []
     observation = envs.reset()
@@ -56,8 +58,9 @@ def train(arguments: argparse.Namespace) -> list[float]:
     envs, fresh = (
         make_vec_env(arguments.env, n_envs=arguments.num_envs, seed=seed, env_kwargs=task) for seed in (arguments.seed, arguments.seed + 10_000)
     )
+    learner = importlib.import_module({"sb3": "sb3_contrib", "sbx": "sbx"}[arguments.learner])
     horizon = gymnasium.spec(arguments.env).max_episode_steps
-    model = TQC(
+    model = learner.TQC(
         "MultiInputPolicy",
         envs,
         replay_buffer_class=HerReplayBuffer,
@@ -65,6 +68,7 @@ def train(arguments: argparse.Namespace) -> list[float]:
         learning_starts=2 * horizon * arguments.num_envs,
         learning_rate=1e-3,
         gamma=0.95,
+        ent_coef="auto_0.005",  # it would begin at 1, ten times what there is to win
         batch_size=256,
         gradient_steps=arguments.gradient_steps,
         policy_kwargs={"net_arch": [128, 128]},
@@ -79,12 +83,13 @@ def train(arguments: argparse.Namespace) -> list[float]:
 def parse(given: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", default="hindrl/FixedGridPickAndPlace-v0")
+    parser.add_argument("--learner", choices=["sb3", "sbx"], default="sb3")
     parser.add_argument("--num-objects", type=int, default=1)
-    parser.add_argument("--size", type=int, default=5)
-    parser.add_argument("--steps", type=int, default=40_000, help="environment steps")
+    parser.add_argument("--size", type=int, default=4)
+    parser.add_argument("--steps", type=int, default=20_000, help="environment steps")
     parser.add_argument("--num-envs", type=int, default=8)
     parser.add_argument("--gradient-steps", type=int, default=4, help="after each step of all environments")
-    parser.add_argument("--eval-every", type=int, default=4_000)
+    parser.add_argument("--eval-every", type=int, default=2_000)
     parser.add_argument("--eval-episodes", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
     return parser.parse_args(given)

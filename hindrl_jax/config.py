@@ -432,7 +432,7 @@ _CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
     ("q_filter bc_loss bc_action", lambda c: c.algo == "bc" or c.agent.bc_weight > 0.0, "nothing is cloned: raise --bc-weight"),
     ("k", lambda c: c.goal.m > 0, "epsilon depends on it only for m > 0: add --m 5"),
     (
-        "m k",
+        "m k epsilon",
         lambda c: _relabels(c) or c.goal.epsilon_filtering or c.goal.has_achieved_goals,
         "epsilon is used only for relabelling, achieved goals and the filter: choose --algo hindrl",
     ),

@@ -30,7 +30,8 @@ class Task:
     expert: type[Any] | None
     """Frozen dataclass with a method act(key, env, state), or for Gymnasium's environments act(observation, rng); None where nobody can show."""
     viewer_module: str | None
-    """Module with save_png(env, state, path), save_gif(env, states, path) and animation(env, states); imported only to draw. None where the environment draws itself."""
+    """Module with save_png(env, state, path), save_gif(env, states, path) and animation(env, states); imported only to draw. None where the
+    environment draws itself."""
     family: Family
     """Which of the presets' recipes is for it."""
     summary: str
