@@ -10,6 +10,7 @@ pytest.importorskip("sb3_contrib")
 sys.path.insert(0, str(Path(__file__).parent.parent / "examples"))
 
 import sb3_her_tqc
+import torch
 from stable_baselines3.common.env_checker import check_env
 
 
@@ -19,6 +20,7 @@ def test_stable_baselines_finds_no_fault(name):
 
 
 def test_tqc_with_her_trains():
+    torch.set_num_threads(1)  # more of them wait for one another where the cores have other work
     flags = "--size 4 --num-envs 2 --steps 640 --eval-every 320 --eval-episodes 4"
     success = sb3_her_tqc.train(sb3_her_tqc.parse(flags.split()))
     assert len(success) == 2
