@@ -46,7 +46,7 @@ def main() -> None:
 
     import jax
 
-    from benchmarks import environments, gradient_step, reach_parity, reach_speed, relabelling, replay_size, report, seeds, startup, timing
+    from benchmarks import environments, gradient_step, host_loop, reach_parity, reach_speed, relabelling, replay_size, report, seeds, startup, timing
     from benchmarks.timing import Effort, Options
 
     parts = {
@@ -54,6 +54,7 @@ def main() -> None:
         "environments": environments,
         "reach_speed": reach_speed,
         "reach_parity": reach_parity,
+        "host_loop": host_loop,
         "relabelling": relabelling,
         "replay_size": replay_size,
         "seeds": seeds,

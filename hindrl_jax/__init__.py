@@ -33,11 +33,15 @@ _EXPORTS = {
     "make": "hindrl_jax.registry",
     "preset": "hindrl_jax.presets",
     "record_demonstrations": "hindrl_jax.experiment",
+    "record_gymnasium": "hindrl_jax.host",
     "save_demonstrations": "hindrl_jax.datasets",
     "save_run": "hindrl_jax.runs",
 }
 
 __all__ = ["__version__", *_EXPORTS]
+
+
+importlib.import_module("hindrl_jax.registration").register()  # so that `gymnasium.make("hindrl/...")` finds our environments
 
 
 def __getattr__(name: str) -> Any:

@@ -131,10 +131,13 @@ class GoalConfig:
     """Distance in steps between the demonstration states whose mean distance gives epsilon (thesis eq. 4.7); 0 gives epsilon 0."""
     k: float = 0.0
     """Weight of the standard deviation in epsilon (thesis eq. 4.7)."""
+    epsilon: float | None = None
+    """Epsilon itself, the same in all dimensions of the goal, in place of the one that the demonstrations give."""
     epsilon_filtering: bool = False
     """Drop demonstration goals that lie within epsilon of the last kept one (thesis algorithm 6, Smooth HinDRL)."""
-    behavioural_goals: Literal["final_demonstration_states", "task"] = "final_demonstration_states"
-    """Goal of a rollout: the end of a random demonstration (thesis algorithm 5), or the task's one constant goal (original code)."""
+    behavioural_goals: Literal["final_demonstration_states", "task", "environment"] = "final_demonstration_states"
+    """Goal of a rollout: the end of a random demonstration (thesis algorithm 5), the task's one constant goal (original code), or in Gymnasium's
+    environments, and only there, the goal that the episode comes with."""
     achieved_goal_ratio: float = 0.0
     """Share of training episodes with another behavioural goal: a state reached earlier in training, whatever the task (thesis chapter 6). They
     are rewarded, when drawn, for reaching that goal. Evaluations never have one."""
@@ -153,12 +156,16 @@ class GoalConfig:
             self,
             m=(self.m >= 0, "0 or more"),
             k=(self.k >= 0.0, "0 or more"),
+            epsilon=(self.epsilon is None or self.epsilon >= 0.0, "0 or more, or None"),
             achieved_goal_ratio=(0.0 <= self.achieved_goal_ratio <= 1.0, "between 0 and 1"),
             final_achieved_goal_ratio=(
                 self.final_achieved_goal_ratio is None or 0.0 <= self.final_achieved_goal_ratio <= 1.0,
                 "between 0 and 1, or None",
             ),
         )
+
+        if self.epsilon is not None and self.m > 0:
+            raise ValueError(f"m = {self.m} is of no use while epsilon = {self.epsilon} is given: set m to 0, or epsilon to None")
 
     @property
     def has_achieved_goals(self) -> bool:
@@ -432,7 +439,7 @@ _CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
     ("q_filter bc_loss bc_action", lambda c: c.algo == "bc" or c.agent.bc_weight > 0.0, "nothing is cloned: raise --bc-weight"),
     ("k", lambda c: c.goal.m > 0, "epsilon depends on it only for m > 0: add --m 5"),
     (
-        "m k",
+        "m k epsilon",
         lambda c: _relabels(c) or c.goal.epsilon_filtering or c.goal.has_achieved_goals,
         "epsilon is used only for relabelling, achieved goals and the filter: choose --algo hindrl",
     ),

@@ -47,15 +47,20 @@ def over_seeds(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
     return jax.shard_map(mapped, mesh=mesh, in_specs=_SEEDS, out_specs=_SEEDS, check_vma=False)
 
 
+def by_seed(mesh: Mesh) -> NamedSharding:
+    """Where arrays (S, ...) lie on the mesh, for `jax.device_put`."""
+    return NamedSharding(mesh, _SEEDS)
+
+
 def shapes_on(tree: Any, mesh: Mesh) -> Any:
     """Shapes and dtypes of a tree with leaves (S, ...), placed on the mesh; to compile a program before its arguments exist."""
-    sharding = NamedSharding(mesh, _SEEDS)
+    sharding = by_seed(mesh)
     return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding), tree)
 
 
 def spread(tree: Any, mesh: Mesh) -> Any:
     """Puts numpy arrays (S, ...), the same on every host, onto the devices; each host hands over the seeds of its own."""
-    sharding = NamedSharding(mesh, _SEEDS)
+    sharding = by_seed(mesh)
     return jax.tree.map(lambda leaf: jax.make_array_from_callback(leaf.shape, sharding, lambda index: leaf[index]), tree)
 
 

@@ -19,13 +19,14 @@ from hindrl_jax.agent import Metrics
 from hindrl_jax.config import SWEEPABLE, TrainConfig, sweepable_value, with_traced_values
 from hindrl_jax.devices import free_memory, gather, over_seeds, seed_mesh, shapes_on, spread, tree_bytes
 from hindrl_jax.errors import UserError
+from hindrl_jax.from_gymnasium import is_gymnasium
+from hindrl_jax.host import FRESH_EPISODES, HostPrograms, record_gymnasium
 from hindrl_jax.registry import task
 from hindrl_jax.rollout import Evaluation
 from hindrl_jax.train import Guidance, TrainState
 from hindrl_jax.types import Array, Episodes, RestorableEnvironment, compiler_options
 
 SOLVED = 0.95
-FRESH_EPISODES = 100
 CHUNKS_PER_EVALUATION = 10
 _RUN_ONCE = {"xla_backend_optimization_level": 0}  # for programs whose compilation takes longer than their one run
 
@@ -157,12 +158,18 @@ def record_demonstrations(env: RestorableEnvironment, num_demos: int, *, seed: i
       env: from `make`.
       num_demos: at least 1; only solved episodes are kept.
       seed: equal seeds give equal demonstrations.
-      expert: another expert: a frozen dataclass with a method act(key, env, state).
+      expert: another expert: a frozen dataclass with a method act(key, env, state), for Gymnasium's environments act(observation, rng).
 
     Raises:
       UserError: if `num_demos` is below 1 or the expert cannot solve the task within its horizon.
     """
-    expert = task(env.name).expert() if expert is None else expert
+    if expert is None:
+        expert_class = task(env.name).expert
+        if expert_class is None:
+            raise UserError(f"no expert is known for {env.name}: give demonstrations from a file, which hindrl_jax.record_gymnasium can make")
+        expert = expert_class()
+    if is_gymnasium(env):
+        return record_gymnasium(env, expert.act, num_demos, seed=seed)
     return record(jax.random.fold_in(jax.random.key(seed), 1), env, expert, num_demos)
 
 
@@ -174,6 +181,27 @@ def check_trainable(env: RestorableEnvironment) -> None:
     """
     if on_host(env):
         raise UserError(f"{env.name} cannot be trained in robosuite, which steps one arm outside JAX: train with backend closed_form or mjx")
+
+
+def check_goals(env: RestorableEnvironment, config: TrainConfig) -> None:
+    """Makes sure that the environment can give what the config asks of episodes.
+
+    Raises:
+      UserError: if not.
+    """
+    if not is_gymnasium(env):
+        if config.goal.behavioural_goals == "environment":
+            raise UserError(
+                f"behavioural_goals = environment is for Gymnasium's environments: {env.name} gives its episodes no goals; choose another"
+            )
+        return
+    if config.goal.behavioural_goals != "environment":
+        raise UserError(
+            f"behavioural_goals = {config.goal.behavioural_goals} cannot be had in {env.name}, whose episodes come with goals of their own: "
+            "choose environment"
+        )
+    if config.demo_reset_ratio > 0.0:
+        raise UserError(f"demo_reset_ratio = {config.demo_reset_ratio} cannot be had in {env.name}, whose states are not known: set it to 0")
 
 
 def steps_to_learn(env: RestorableEnvironment, config: TrainConfig) -> int:
@@ -210,7 +238,8 @@ def fit(
       report: called after compilation, several times between evaluations, after each evaluation, and at the end.
       restore: called before anything is computed with a result whose guidance, state and key are `jax.ShapeDtypeStruct`s. Where it returns
         what `report` was given at some time in an earlier call with the same arguments, the experiment goes on from there, and all that
-        follows is the same, bit for bit; see `hindrl_jax.checkpoints`. Where it returns None, the experiment begins.
+        follows is the same, bit for bit; see `hindrl_jax.checkpoints`. Where it returns None, the experiment begins. In environments of
+        Gymnasium the episodes that were under way are lost, so there what follows is another experiment, as good as the first.
 
     Returns:
       The finished experiment. With several hosts, its agents are gathered on each of them, and the replay is not.
@@ -226,6 +255,7 @@ def fit(
     tables = _demonstrations_per_seed(demonstrations, seeds, env)
     configs = _configs_per_seed(config, seeds)
     config = configs[0]
+    check_goals(env, config)
     if config.goal.misalign_demo_actions and int(tables.lengths.min()) < 2:
         raise UserError("misalign_demo_actions needs demonstrations of at least 2 steps: turn it off or record others")
 
@@ -233,7 +263,7 @@ def fit(
         tables = tables.replace(states=None)  # nobody needs them on the devices
 
     started = time.perf_counter()
-    programs = _Programs(env, configs, tables)
+    programs = _programs(env, configs, tables)
     result = Result(env=env, configs=configs, seeds=tuple(seeds), **programs.shapes, rows=[], compile_seconds=0.0)
     restored = restore(result)
     seeds_on_devices, tables, values = spread((np.asarray(seeds, np.uint32), tables, programs.values), programs.mesh)
@@ -345,17 +375,31 @@ def _swept_fields(configs: Sequence[TrainConfig]) -> list[str]:
     return [name for name in SWEEPABLE if len({sweepable_value(config, name) for config in configs}) > 1]
 
 
+def _programs(env: RestorableEnvironment, configs: Sequence[TrainConfig], demonstrations: Episodes) -> _Programs | HostPrograms:
+    if not is_gymnasium(env):
+        return _Programs(env, configs, demonstrations)
+    warm_up, chunk, values = _extent(env, configs)
+    programs = HostPrograms(env, configs, demonstrations, values, chunk=chunk, warm_up=warm_up)
+    _check_fits_into_memory(programs.shapes["state"], len(configs), programs.mesh)
+    return programs
+
+
+def _extent(env: RestorableEnvironment, configs: Sequence[TrainConfig]) -> tuple[int, int, dict[str, np.ndarray]]:
+    """Iterations of the random steps at the start and of a chunk, and the swept values (S,) of the configs."""
+    config = configs[0]
+    warm_up, per_iteration = (0, 1) if config.algo == "bc" else (training.warm_up_iterations(env, config), config.num_envs)
+    chunk = max(1, min(config.eval_every // CHUNKS_PER_EVALUATION, steps_to_learn(env, config)) // per_iteration)
+    return warm_up, chunk, {name: np.asarray([sweepable_value(c, name) for c in configs], np.float32) for name in _swept_fields(configs)}
+
+
 class _Programs:
     """The compiled programs of one experiment, mapped over its runs. Each takes the swept values (S,) of the config as its last argument."""
 
     def __init__(self, env: RestorableEnvironment, configs: Sequence[TrainConfig], demonstrations: Episodes):
         config = configs[0]
         cloning = config.algo == "bc"
-        self.warm_up, per_iteration = (0, 1) if cloning else (training.warm_up_iterations(env, config), config.num_envs)
+        self.warm_up, self.chunk, self.values = _extent(env, configs)
         self.steps_at_random = self.warm_up * config.num_envs
-        to_learn = steps_to_learn(env, config)
-        self.chunk = max(1, min(config.eval_every // CHUNKS_PER_EVALUATION, to_learn) // per_iteration)
-        self.values = {name: np.asarray([sweepable_value(c, name) for c in configs], np.float32) for name in _swept_fields(configs)}
         self.mesh = seed_mesh(len(configs))
 
         def program(function: Callable[..., Any], *, donate: bool = False) -> Any:

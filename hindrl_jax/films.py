@@ -60,7 +60,21 @@ def save_film(env: RestorableEnvironment, episodes: Sequence[Sequence[Any]], pat
         more_pictures, more_seconds = draw.animation(env, states, captions=captions)
         pictures += more_pictures
         seconds += more_seconds
-    (drawing.save_gif if path.suffix == ".gif" else save_mp4)(pictures, seconds, path)
+    save_pictures(pictures, seconds, path)
+
+
+def save_pictures(pictures: Sequence[np.ndarray], seconds: Sequence[float], path: Path) -> None:
+    """Saves pictures (H, W, 3) uint8 as a film, each shown for so many seconds; as a .png, the last one alone.
+
+    Raises:
+      OSError: if the file cannot be written.
+    """
+    from envs import drawing
+
+    if path.suffix == ".png":
+        drawing.save_png(pictures[-1], path)
+    else:
+        (drawing.save_gif if path.suffix == ".gif" else save_mp4)(pictures, seconds, path)
 
 
 def save_mp4(pictures: Sequence[np.ndarray], seconds: Sequence[float], path: Path) -> None:

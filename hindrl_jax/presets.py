@@ -4,7 +4,7 @@ default    the project's own recipe, for a laptop CPU
 thesis     the hyperparameters of the thesis's appendix, on plain correct code
 original   the same, with the quirks of the original implementation that explain its published figures
 
-Each has one column for the grid worlds and one for the reach tasks, as the thesis's appendix does.
+Each has one column for the grid worlds and one for the reach tasks, as the thesis's appendix does. Environments of Gymnasium have the default only.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, Literal, get_args
 
 from hindrl_jax.config import AgentConfig, Algorithm, BatchConfig, GoalConfig, TrainConfig
 from hindrl_jax.errors import UserError
-from hindrl_jax.registry import Family, did_you_mean, task
+from hindrl_jax.registry import Family, did_you_mean, make, task
 from hindrl_jax.types import Environment
 
 Preset = Literal["default", "thesis", "original"]
@@ -38,6 +38,10 @@ def preset(algo: Algorithm = "hindrl", name: Preset = "default", *, env: str | E
         if value not in known:
             raise UserError(f"unknown {kind} {value!r}{did_you_mean(value, known)}; choose one of {', '.join(known)}")
     family = task(env if isinstance(env, str) else env.name).family
+    if family == "gymnasium":
+        if name != "default":
+            raise UserError(f"the preset {name} is for the thesis's tasks: choose default for environments of Gymnasium")
+        return _as_algorithm(_gymnasium(algo, make(env) if isinstance(env, str) else env), algo)
     return _as_algorithm({"default": _default, "thesis": _thesis, "original": _original}[name](algo, family), algo)
 
 
@@ -84,6 +88,35 @@ def _default(algo: Algorithm, family: Family) -> TrainConfig:
             actor_average_span=0.5,
             bc_weight=0.03,
             input_encoding=encoding,
+        ),
+    )
+
+
+def _gymnasium(algo: Algorithm, env: Any) -> TrainConfig:
+    """The recipe for environments of Gymnasium: rollouts aim at the goal that an episode comes with, as the demonstrations did."""
+    tolerance = env.goal_tolerance
+    epsilon = dict(m=5) if tolerance is None else dict(epsilon=round(float(tolerance.min()), 4))
+    goal = GoalConfig(behavioural_goals="environment", **epsilon)
+    if algo == "bc":
+        config = _default("bc", "reach")
+        return dataclasses.replace(config, goal=goal, eval_episodes=50)
+    return TrainConfig(
+        steps=50_000,
+        num_envs=8,
+        updates_per_iteration=8,
+        learning_starts=1_000,
+        eval_every=2_500,
+        eval_episodes=50,
+        goal=goal,
+        batch=BatchConfig(n_step=1, num_sampled_goals=1.0, hindrl_sampling_strategy="joint_union"),
+        agent=AgentConfig(
+            net_arch=(256, 256),
+            layer_norm=True,
+            learning_rate=1e-3,
+            clip_targets=True,
+            bc_weight=0.1,
+            initial_alpha=0.01,
+            input_encoding="standardised",
         ),
     )
 

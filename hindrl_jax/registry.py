@@ -11,12 +11,14 @@ from typing import Any, Literal
 
 from envs.grid import FixedGridPickAndPlace, GridPickAndPlace
 from envs.reach import FixedParameterizedReach, ParameterizedReach
+from experts import fetch
 from experts.grid import GridExpert
 from experts.reach import ReachExpert
+from hindrl_jax import from_gymnasium
 from hindrl_jax.errors import UserError
 from hindrl_jax.types import RestorableEnvironment
 
-Family = Literal["grid", "reach"]
+Family = Literal["grid", "reach", "gymnasium"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,10 +27,11 @@ class Task:
 
     environment: type[Any]
     """Frozen dataclass; its fields are the environment's arguments."""
-    expert: type[Any]
-    """Frozen dataclass with a method act(key, env, state)."""
-    viewer_module: str
-    """Module with save_png(env, state, path), save_gif(env, states, path) and animation(env, states); imported only to draw."""
+    expert: type[Any] | None
+    """Frozen dataclass with a method act(key, env, state), or for Gymnasium's environments act(observation, rng); None where nobody can show."""
+    viewer_module: str | None
+    """Module with save_png(env, state, path), save_gif(env, states, path) and animation(env, states); imported only to draw. None where the
+    environment draws itself."""
     family: Family
     """Which of the presets' recipes is for it."""
     summary: str
@@ -47,13 +50,17 @@ TASKS: dict[str, Task] = {
 
 
 def task(name: str) -> Task:
-    """The task of that name.
+    """The task of that name: one of `TASKS`, or "gymnasium:ID".
 
     Raises:
       UserError: if there is none; the message lists the names.
     """
+    if name.startswith(from_gymnasium.PREFIX):
+        environment = from_gymnasium.environment_class(name)
+        expert = next((expert for expert in fetch.EXPERTS if environment.id.rpartition(":")[2].startswith(f"{expert.tasks}-")), None)
+        return Task(environment, expert, None, "gymnasium", "an environment of Gymnasium")
     if name not in TASKS:
-        raise UserError(f"unknown environment {name!r}{did_you_mean(name, TASKS)}; choose one of {', '.join(TASKS)}")
+        raise UserError(f"unknown environment {name!r}{did_you_mean(name, TASKS)}; choose one of {', '.join(TASKS)}, or gymnasium:ID")
     return TASKS[name]
 
 
@@ -61,13 +68,15 @@ def make(name: str, **arguments: Any) -> RestorableEnvironment:
     """Builds an environment by name.
 
     Args:
-      name: for example "FixedGridPickAndPlace"; `hindrl envs` lists them.
-      **arguments: fields of the environment, for example num_objects=3.
+      name: for example "FixedGridPickAndPlace", `hindrl envs` lists them; or "gymnasium:FetchReach-v4", which is a `from_gymnasium.GymnasiumEnv`.
+      **arguments: fields of the environment, for example num_objects=3; for Gymnasium's also what its own `make` takes.
 
     Raises:
       UserError: for an unknown name or argument, or a value that the environment refuses.
     """
     environment = task(name).environment
+    if name.startswith(from_gymnasium.PREFIX):
+        return checked(lambda: from_gymnasium.make(name, arguments))
     known = [field.name for field in dataclasses.fields(environment)]
     for argument in arguments:
         if argument not in known:
@@ -76,7 +85,7 @@ def make(name: str, **arguments: Any) -> RestorableEnvironment:
 
 
 def viewer(env: RestorableEnvironment) -> ModuleType:
-    """The module that draws this environment."""
+    """The module that draws this environment, which is one of ours."""
     return importlib.import_module(task(env.name).viewer_module)
 
 

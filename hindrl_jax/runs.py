@@ -32,14 +32,16 @@ import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
 from experts.recording import on_host, player
-from hindrl_jax import plots, rollout
+from hindrl_jax import host, plots, rollout
 from hindrl_jax import train as training
 from hindrl_jax.agent import InputScale
 from hindrl_jax.config import TrainConfig, with_values
 from hindrl_jax.datasets import why_unwritable
+from hindrl_jax.devices import seed_mesh
 from hindrl_jax.errors import UserError, one_line
 from hindrl_jax.experiment import Result, Row
-from hindrl_jax.films import check_film, save_film
+from hindrl_jax.films import check_film, save_film, save_pictures
+from hindrl_jax.from_gymnasium import Simulators, is_gymnasium
 from hindrl_jax.goals import GoalTable, sample_goals
 from hindrl_jax.registry import checked, did_you_mean, make
 from hindrl_jax.types import RestorableEnvironment, action_to_env, compiler_options
@@ -453,7 +455,9 @@ class Run:
           report: called with the number of episodes played so far, all seeds together, where they are played one by one: in robosuite.
         """
         keys = jax.random.split(jax.random.key(0) if key is None else key, len(self.spec.seeds))
-        if on_host(self.spec.env):
+        if is_gymnasium(self.spec.env):
+            result = self._play_in_gymnasium(keys, episodes, stochastic=stochastic)
+        elif on_host(self.spec.env):
             result = self._play_one_by_one(keys, episodes, stochastic=stochastic, report=report)
         else:
             result = self._play_side_by_side(keys, episodes, stochastic=stochastic)
@@ -472,6 +476,13 @@ class Run:
 
         program = jax.jit(play_episodes, compiler_options=compiler_options(env))
         return jax.device_get(program(keys, self.policies, self.behavioural_goals, self.scale))
+
+    def _play_in_gymnasium(self, keys: jax.Array, episodes: int, *, stochastic: bool) -> rollout.Evaluation:
+        """Episodes of all seeds side by side, up to `num_envs` for each; leaves (S, episodes)."""
+        num_seeds = len(self.spec.seeds)
+        policies = host.Policies(self.spec.env, self.spec.config, seed_mesh(num_seeds), stochastic=stochastic)
+        with contextlib.closing(Simulators(self.spec.env, num_seeds * min(self.spec.config.num_envs, episodes))) as simulators:
+            return host.evaluate(keys, simulators, policies, self.policies, self.scale, episodes)
 
     def _play_one_by_one(self, keys: jax.Array, episodes: int, *, stochastic: bool, report: Callable[[int], None]) -> rollout.Evaluation:
         """One episode after the other; leaves (S, episodes)."""
@@ -515,10 +526,28 @@ class Run:
         seed = self.spec.seeds[0] if seed is None else seed
         if seed not in self.spec.seeds:
             raise UserError(f"{self.path} has no seed {seed}: choose one of {', '.join(map(str, self.spec.seeds))}")
-        play_episode = player(env, self._act(self.spec.seeds.index(seed), stochastic=stochastic, any_goal=False), 1)
+        index = self.spec.seeds.index(seed)
+        if is_gymnasium(env):
+            return self._film(path, index, keys, stochastic=stochastic)
+        play_episode = player(env, self._act(index, stochastic=stochastic, any_goal=False), 1)
         played = [jax.device_get(play_episode(key_episode)) for key_episode in keys]
         draw_episodes(path, env, [episodes.states[0, : int(episodes.lengths[0]) + 1] for episodes in played])
         return sum(bool(episodes.terminated[0]) for episodes in played)
+
+    def _film(self, path: Path, index: int, keys: jax.Array, *, stochastic: bool) -> int:
+        """`render` of an environment of Gymnasium, which draws itself."""
+        env = self.spec.env
+        actor, scale = jax.tree.map(lambda leaf: leaf[index : index + 1], (self.policies, self.scale))
+        policies = host.Policies(env, self.spec.config, seed_mesh(1), stochastic=stochastic)
+        pictures, num_solved = [], 0
+        for key in keys:
+            key_seed, key_act = jax.random.split(key)
+            episode, solved = host.film(env, int(jax.random.bits(key_seed)), policies.acting(key_act[None], actor, scale))
+            pictures += episode
+            num_solved += solved
+        with disk_trouble(path):
+            save_pictures(pictures, [1.0 / env.description.render_fps] * len(pictures), path)
+        return num_solved
 
 
 def draw_episodes(path: Path, env: RestorableEnvironment, episodes: Sequence[np.ndarray]) -> None:
@@ -528,6 +557,8 @@ def draw_episodes(path: Path, env: RestorableEnvironment, episodes: Sequence[np.
       UserError: for another kind of file, a place that cannot be written, or states of another environment.
     """
     check_film(path, len(episodes))
+    if is_gymnasium(env):
+        raise UserError(f"demonstrations of {env.name} hold no states, so they cannot be drawn; `hindrl render` films the policies of a run")
     for states in episodes:
         if states.shape[-1] != env.state_dim:
             raise UserError(f"states of {states.shape[-1]} numbers are not those of {env.name}, which has {env.state_dim}: record them again")

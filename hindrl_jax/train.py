@@ -24,7 +24,7 @@ from hindrl_jax.randomness import uniform_index
 from hindrl_jax.relabel import hindsight_steps
 from hindrl_jax.replay import ReplayState
 from hindrl_jax.rollout import Act, Evaluation, RolloutState, StartTable
-from hindrl_jax.types import Array, Environment, Episodes, Transition, action_to_env, tree_where
+from hindrl_jax.types import Array, Environment, Episodes, TimeStep, Transition, action_to_env, tree_where
 
 
 @struct.dataclass(kw_only=True)
@@ -76,8 +76,14 @@ def guidance(demonstrations: Episodes, env: Environment, config: TrainConfig) ->
     if not goal_config.rescale_demo_actions:
         demonstrations = demonstrations.replace(actions=action_to_env(demonstrations.actions, env))
     achieved, lengths = env.achieved_goal(demonstrations.observations), demonstrations.lengths
-    epsilon = goals.epsilon_from_demonstrations(achieved, lengths, m=goal_config.m, k=goal_config.k)
-    if goal_config.behavioural_goals == "task":
+    if goal_config.epsilon is None:
+        epsilon = goals.epsilon_from_demonstrations(achieved, lengths, m=goal_config.m, k=goal_config.k)
+    else:
+        epsilon = jnp.full(env.goal_dim, goal_config.epsilon)
+    if goal_config.behavioural_goals == "environment":
+        desired_goals = demonstrations.desired_goals
+        behavioural_goals = GoalTable(goals=desired_goals, count=jnp.asarray(desired_goals.shape[0]))
+    elif goal_config.behavioural_goals == "task":
         behavioural_goals = goals.constant_goal(env.task_goal())
         desired_goals = jnp.broadcast_to(behavioural_goals.goals, (lengths.shape[0], env.goal_dim))
     else:
@@ -100,8 +106,12 @@ def guidance(demonstrations: Episodes, env: Environment, config: TrainConfig) ->
     )
 
 
-def init(key: Array, data: Guidance, env: Environment, config: TrainConfig) -> TrainState:
+def init(key: Array, data: Guidance, env: Environment, config: TrainConfig, *, begun: RolloutState | None = None) -> TrainState:
     """A fresh agent, an empty replay and `num_envs` episodes about to begin.
+
+    Args:
+      key, data, env, config: see the module's other functions.
+      begun: the episodes, where they have begun outside JAX.
 
     Raises:
       UserError: if the replay is too small.
@@ -121,7 +131,7 @@ def init(key: Array, data: Guidance, env: Environment, config: TrainConfig) -> T
     return TrainState(
         agent=agents.init(key_agent, config.agent, **dims),
         replay=empty,
-        rollout=_new_episodes(key_rollout, data, env, config, 0.0),
+        rollout=_new_episodes(key_rollout, data, env, config, 0.0) if begun is None else begun,
         key=key_train,
         env_steps=jnp.asarray(0),
         updates=jnp.asarray(0),
@@ -203,10 +213,35 @@ def make_policy(actor: Any, scale: InputScale, env: Environment, config: TrainCo
 def _interact(key: Array, state: TrainState, data: Guidance, env: Environment, config: TrainConfig, act: Act) -> TrainState:
     """One step of every environment, stored in the replay."""
     key_act, key_reset, key_goals, key_nearby = jax.random.split(key, 4)
-    before, progress = state.rollout, _progress(state, config)
+    before = state.rollout
     action = act(key_act, before.observation, before.desired_goal)
-    restarted = _new_episodes(key_reset, data, env, config, progress)
+    restarted = _new_episodes(key_reset, data, env, config, _progress(state, config))
     after, time_step = rollout.step(before, restarted, action, env)
+    return remember(key_goals, key_nearby, state, action, time_step, after, data, env, config)
+
+
+def remember(
+    key_goals: Array,
+    key_nearby: Array,
+    state: TrainState,
+    action: Array,
+    time_step: TimeStep,
+    after: RolloutState,
+    data: Guidance,
+    env: Environment,
+    config: TrainConfig,
+) -> TrainState:
+    """Stores one step of every environment in the replay.
+
+    Args:
+      key_goals, key_nearby: random keys.
+      state: before the step.
+      action: (E, A) in [-1, 1], what was done there.
+      time_step: (E, ...) what came of it, its observation the true next one.
+      after: where the environments are now: in a new episode, those whose episode has ended.
+      data, env, config: the run's; of the environment, only what goals and actions are.
+    """
+    before, progress = state.rollout, _progress(state, config)
     nearby_goal = None
     if _uses_intersections(config):
         achieved, inclusive = env.achieved_goal(time_step.observation), config.batch.inclusive_goal_test
@@ -229,15 +264,21 @@ def _interact(key: Array, state: TrainState, data: Guidance, env: Environment, c
     return state.replace(replay=stored, rollout=after, env_steps=state.env_steps + action.shape[0])
 
 
+def act_at_random(env: Environment) -> Act:
+    """Uniformly random actions."""
+
+    def act(key: Array, observation: Array, desired_goal: Array) -> Array:
+        return jax.random.uniform(key, (observation.shape[0], env.action_dim), minval=-1.0, maxval=1.0)
+
+    return act
+
+
 def collect(state: TrainState, data: Guidance, *, env: Environment, config: TrainConfig, num_iterations: int) -> TrainState:
     """Fills the replay by uniformly random actions: `num_iterations` steps of every environment."""
 
-    def uniform(key: Array, observation: Array, desired_goal: Array) -> Array:
-        return jax.random.uniform(key, (observation.shape[0], env.action_dim), minval=-1.0, maxval=1.0)
-
     def iteration(state: TrainState, _: None) -> tuple[TrainState, None]:
         key, key_interact = jax.random.split(state.key)
-        return _interact(key_interact, state.replace(key=key), data, env, config, uniform), None
+        return _interact(key_interact, state.replace(key=key), data, env, config, act_at_random(env)), None
 
     return jax.lax.scan(iteration, state, length=num_iterations)[0]
 
@@ -260,26 +301,33 @@ def learn(state: TrainState, data: Guidance, *, env: Environment, config: TrainC
         key, key_interact, key_batch, key_updates = jax.random.split(state.key, 4)
         act = make_policy(state.agent.actor, data.scale, env, config, stochastic=True)
         state = _interact(key_interact, state.replace(key=key), data, env, config, act)
-        given = dict(
-            replay=state.replay,
-            demonstrations=data.demonstrations,
-            table=data.goals,
-            achieved_goal=env.achieved_goal,
-            epsilon=data.epsilon,
-            config=config.batch,
-        )
-        if config.batch.has_priorities:
-            key_batch, key_errors = jax.random.split(key_batch)
-            draw = functools.partial(replay.sample_prioritised_batch, **given)
-            batches, drawn = jax.vmap(draw)(jax.random.split(key_batch, config.updates_per_iteration))
-            state, metrics = _gradient_steps(key_updates, state, batches, data, env, config)
-            return _with_new_priorities(key_errors, state, batches, drawn, data, env, config), metrics
-        draw = functools.partial(replay.sample_batch, demo_rows=replay.num_demo_rows(state.env_steps, config.batch), **given)
-        batches = jax.vmap(draw)(jax.random.split(key_batch, config.updates_per_iteration))
-        return _gradient_steps(key_updates, state, batches, data, env, config)
+        return improve(key_batch, key_updates, state, data, env, config)
 
     state, metrics = jax.lax.scan(iteration, _reset_agent_if_due(state, env, config), length=num_iterations)
     return state, jax.tree.map(jnp.mean, metrics)
+
+
+def improve(
+    key_batch: Array, key_updates: Array, state: TrainState, data: Guidance, env: Environment, config: TrainConfig
+) -> tuple[TrainState, Metrics]:
+    """`updates_per_iteration` gradient steps on batches drawn from the replay and the demonstrations, and their mean metrics."""
+    given = dict(
+        replay=state.replay,
+        demonstrations=data.demonstrations,
+        table=data.goals,
+        achieved_goal=env.achieved_goal,
+        epsilon=data.epsilon,
+        config=config.batch,
+    )
+    if config.batch.has_priorities:
+        key_batch, key_errors = jax.random.split(key_batch)
+        draw = functools.partial(replay.sample_prioritised_batch, **given)
+        batches, drawn = jax.vmap(draw)(jax.random.split(key_batch, config.updates_per_iteration))
+        state, metrics = _gradient_steps(key_updates, state, batches, data, env, config)
+        return _with_new_priorities(key_errors, state, batches, drawn, data, env, config), metrics
+    draw = functools.partial(replay.sample_batch, demo_rows=replay.num_demo_rows(state.env_steps, config.batch), **given)
+    batches = jax.vmap(draw)(jax.random.split(key_batch, config.updates_per_iteration))
+    return _gradient_steps(key_updates, state, batches, data, env, config)
 
 
 def _gradient_steps(

@@ -83,6 +83,7 @@ BAD = [
     (BatchConfig, "demo_priority_bonus", [-0.1, float("inf"), "1", 0.5]),  # 0.5 while transitions are drawn uniformly
     (GoalConfig, "m", [-1, 0.5]),
     (GoalConfig, "k", [-0.1, float("nan")]),
+    (GoalConfig, "epsilon", [-0.1, float("nan"), "0.1"]),
     (GoalConfig, "epsilon_filtering", [1]),
     (GoalConfig, "behavioural_goals", ["final"]),
     (GoalConfig, "achieved_goal_ratio", [-0.1, 1.1, None]),
@@ -147,6 +148,12 @@ def test_bad_values_are_named(config, name, value):
 def test_the_share_of_demonstrations_follows_from_priorities_or_from_the_steps():
     with pytest.raises(ValueError, match=r"reach_zero = 10 is of no use with priority_exponent = 0\.6.*set one of them to None or 0"):
         BatchConfig(reach_zero=10, priority_exponent=0.6)
+
+
+def test_epsilon_is_given_or_found_but_not_both():
+    GoalConfig(epsilon=0.1)
+    with pytest.raises(ValueError, match="m = 5 is of no use"):
+        GoalConfig(epsilon=0.1, m=5)
 
 
 def test_the_table_of_bad_values_is_complete():

@@ -49,6 +49,8 @@ class _PickAndPlace(abc.ABC):
     """The rules that both tasks share; they differ in where things start and where teleported objects go."""
 
     name: ClassVar[str]
+    render_fps: ClassVar[int] = 7
+    """Steps shown per second of a film."""
 
     size: int = 10
     """Number of cells along each side of the square grid."""
@@ -84,6 +86,21 @@ class _PickAndPlace(abc.ABC):
     @property
     def action_high(self) -> float:
         return 1.0
+
+    @property
+    def observation_low(self) -> np.ndarray:
+        """(4K+2,) float32, the least value of each entry of an observation."""
+        return np.concatenate([np.full(2 * self.num_objects + 2, 1 - self.size), np.zeros(2 * self.num_objects)]).astype(np.float32)
+
+    @property
+    def observation_high(self) -> np.ndarray:
+        """(4K+2,) float32, the greatest."""
+        return np.concatenate([np.full(2 * self.num_objects + 2, self.size - 1), np.ones(2 * self.num_objects)]).astype(np.float32)
+
+    @property
+    def goal_tolerance(self) -> np.ndarray | None:
+        """(4K+2,) zeros: a state solves the task where its achieved goal is `task_goal()`. None without `strict_order`, where others do as well."""
+        return np.zeros(self.goal_dim, np.float32) if self.strict_order else None
 
     @property
     def state_dim(self) -> int:

@@ -156,6 +156,12 @@ def chain() -> Chain:
     )
 
 
+def longest_reach() -> float:
+    """How far the hand could be from the base, in m, if the arm were a rope: the sum of the distances from joint to joint."""
+    c = chain()
+    return float(np.linalg.norm(c.offsets, axis=1).sum() + np.linalg.norm(c.hand_offset))
+
+
 def _box_sides(mass: float, inertia: np.ndarray) -> np.ndarray:
     """Sides (3,) of the homogeneous box with this mass and these principal moments."""
     return np.sqrt(6 / mass * (inertia.sum() - 2 * inertia))

@@ -61,6 +61,8 @@ class _Reach(abc.ABC):
     name: ClassVar[str]
     interchangeable: ClassVar[tuple[str, ...]] = ("backend",)
     """Arguments in which demonstrations may differ from the environment that learns from them."""
+    render_fps: ClassVar[int] = round(1 / panda.CONTROL_PERIOD)
+    """Steps shown per second of a film: real time."""
 
     num_waypoints: int = 2
     """Number of poses to reach, in order."""
@@ -117,6 +119,25 @@ class _Reach(abc.ABC):
         if self.backend != "mjx" or jax.default_backend() != "cpu":
             return {}
         return {"xla_cpu_use_fusion_emitters": False, "xla_cpu_enable_concurrency_optimized_scheduler": False}
+
+    @property
+    def observation_low(self) -> np.ndarray:
+        """(D,) float32, the least value of each entry of an observation, up to rounding."""
+        return self._observation_bounds()[0]
+
+    @property
+    def observation_high(self) -> np.ndarray:
+        """(D,) float32, the greatest."""
+        return self._observation_bounds()[1]
+
+    @property
+    def goal_tolerance(self) -> np.ndarray | None:
+        """(G,) half-width of the box around `task_goal()` in which the achieved goal of a state lies if and only if that solves the task; None if
+        there is no such box. The mask alone decides; the rest is as wide as it must be, and serves where states of an episode are taken as goals."""
+        return np.array(
+            3 * [self.position_tolerance] + (self.goal_dim - self.num_waypoints - 3) * [self.rotation_tolerance] + self.num_waypoints * [0.0],
+            np.float32,
+        )
 
     @property
     def state_dim(self) -> int:
@@ -231,6 +252,12 @@ class _Reach(abc.ABC):
         """(K,) 1 for each waypoint that has been reached."""
         return (jnp.arange(self.num_waypoints) < state.num_reached).astype(jnp.float32)
 
+    def _observation_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """What `observation_low` and `observation_high` return: here of the pose and the mask, with which all observations begin."""
+        high = 3 * [panda.longest_reach()] + (self.pose_dim - 3) * [1.0 if self.orientation == "six_d" else np.pi]
+        mask = self.num_waypoints * [1.0]
+        return np.array([*(-value for value in high), *(0.0 for _ in mask)], np.float32), np.array([*high, *mask], np.float32)
+
     @abc.abstractmethod
     def _observe(self, state: ReachState, arm: panda.Posture) -> Array:
         """(D,) the observation, given the posture that belongs to the state."""
@@ -266,6 +293,11 @@ class FixedParameterizedReach(_Reach):
         """(G,) the last waypoint's pose, and a mask of ones."""
         positions, matrices = self._waypoints(jax.random.key(0))
         return jnp.concatenate([self._pose(positions[-1], matrices[-1]), jnp.ones(self.num_waypoints)])
+
+    @property
+    def goal_tolerance(self) -> np.ndarray | None:
+        """As for both tasks. None where the angle decides and axis-angles are observed, which can be far apart for hands that are close."""
+        return None if (self.orientation, self.rotation_test) == ("axis_angle", "angle") else super().goal_tolerance
 
     def _observe(self, state: ReachState, arm: panda.Posture) -> Array:
         return jnp.concatenate([self._pose(arm.hand_position, arm.hand_rotation), self._mask(state)])
@@ -310,6 +342,13 @@ class ParameterizedReach(_Reach):
     def _observe(self, state: ReachState, arm: panda.Posture) -> Array:
         remaining = [state.positions - arm.hand_position[None], jax.vmap(rotations.between, (None, 0))(arm.hand_rotation, state.rotations)]
         return jnp.concatenate([self._pose(arm.hand_position, arm.hand_rotation), self._mask(state), jnp.concatenate(remaining, axis=1).reshape(-1)])
+
+    def _observation_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        low, high = super()._observation_bounds()
+        reach = panda.longest_reach()
+        nearest, farthest = ([corner + sign * reach for corner in box] for box, sign in ((LOWEST, -1.0), (HIGHEST, 1.0)))
+        remaining = [np.array(self.num_waypoints * [*place, *turn], np.float32) for place, turn in ((nearest, 3 * [-np.pi]), (farthest, 3 * [np.pi]))]
+        return np.concatenate([low, remaining[0]]), np.concatenate([high, remaining[1]])
 
     def _waypoints(self, key: Array) -> tuple[Array, Array]:
         return random_waypoints(key, self.num_waypoints)

@@ -346,7 +346,7 @@ def _open(model: Any) -> tuple[Any, Any]:
       UserError: if OpenGL does not work here.
     """
     wish = os.environ.get("MUJOCO_GL", "").lower().strip()
-    library = wish if wish in ("egl", "osmesa", "glfw", "cgl") else _library()
+    library = wish if wish in ("egl", "osmesa", "glfw", "cgl") else opengl_library()
     try:
         gl_context = importlib.import_module(f"mujoco.{library}").GLContext
         gl_context._context = None  # or else a context that cannot be opened complains once more when it is deleted
@@ -358,7 +358,7 @@ def _open(model: Any) -> tuple[Any, Any]:
         raise UserError(f"cannot draw the arm, since {trouble} here: install libegl1 or libosmesa6, or set MUJOCO_GL=egl, osmesa or glfw") from error
 
 
-def _library() -> str:
+def opengl_library() -> str:
     """The module of MuJoCo that is to open an OpenGL context.
 
     It must be known in advance which one works: MuJoCo uses whatever OpenGL library the process has loaded, so that after one failure another one

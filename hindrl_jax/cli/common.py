@@ -6,15 +6,17 @@ import contextlib
 import io
 import re
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import tyro
 from rich.console import Console
 
 from hindrl_jax.errors import UserError
+from hindrl_jax.registry import TASKS
 
 _TYRO = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
+ENV_HELP = "The environment; `hindrl envs` lists them. Any goal-conditioned one of Gymnasium is gymnasium:ID, as in gymnasium:FetchReach-v4."
 console = Console(highlight=False, soft_wrap=True)
 
 
@@ -23,6 +25,11 @@ def seeds_from(count: int, first: int) -> tuple[int, ...]:
     if not 0 <= first <= 2**32 - count:
         raise UserError(f"--seed {first} is not usable: choose a whole number from 0 to {2**32 - count}")
     return tuple(range(first, first + count))
+
+
+def env_names(name: str) -> Any:
+    """The type of --env: what it may be, `name`, which was looked up before, included."""
+    return Literal[(*TASKS, *({name} - {*TASKS}))]
 
 
 def peek(arguments: Sequence[str], name: str) -> str | None:

@@ -18,7 +18,7 @@ from rich.table import Table
 from experts.by_hand import record_by_hand
 from experts.recording import on_host
 from experts.robosuite_arm import DeviceName
-from hindrl_jax.cli.common import console, counted, episode_key, parse, peek
+from hindrl_jax.cli.common import ENV_HELP, console, counted, env_names, episode_key, parse, peek
 from hindrl_jax.conversion import (
     MINARI_PREFIX,
     ForeignRecording,
@@ -61,11 +61,13 @@ def record(arguments: list[str]) -> None:
     """Record demonstrations with the task's expert, or by hand."""
     name = peek(arguments, "env") or "FixedGridPickAndPlace"
     entry = task(name)
+    if entry.expert is None:
+        raise UserError(f"no expert is known for {name}: record a policy of your own with hindrl_jax.record_gymnasium, from Python")
     namespace = dataclasses.make_dataclass(
         "Record",
         [
             ("options", Record),
-            ("env", Annotated[Literal[tuple(TASKS)], tyro.conf.arg(help="The environment; `hindrl envs` lists them.")], name),
+            ("env", Annotated[env_names(name), tyro.conf.arg(help=ENV_HELP)], name),
             ("environment", entry.environment, entry.environment()),
             ("expert", entry.expert, entry.expert()),
         ],

@@ -8,6 +8,7 @@ from rich import box
 from rich.table import Table
 
 from hindrl_jax.cli.common import console, parse
+from hindrl_jax.from_gymnasium import GymnasiumEnv
 from hindrl_jax.registry import TASKS
 from hindrl_jax.types import RestorableEnvironment
 
@@ -24,3 +25,6 @@ def show(arguments: list[str]) -> None:
         console.print(f"{entry.environment.name}: {entry.summary}")
         for field in dataclasses.fields(entry.environment):
             console.print(f"  --{field.name.replace('_', '-')} (default {field.default})")
+    console.print("gymnasium:ID: an environment of Gymnasium, with goals, as in gymnasium:FetchReach-v4 (from pip install gymnasium-robotics)")
+    for field in dataclasses.fields(GymnasiumEnv):
+        console.print(f"  --{field.name.replace('_', '-')} (default {field.default})")

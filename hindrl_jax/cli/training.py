@@ -13,7 +13,7 @@ import time
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import jax
 import numpy as np
@@ -23,14 +23,14 @@ from rich.table import Table
 
 from hindrl_jax import STARTED
 from hindrl_jax.checkpoints import Checkpoints
-from hindrl_jax.cli.common import console, counted, parse, peek, seeds_from
+from hindrl_jax.cli.common import ENV_HELP, console, counted, env_names, parse, peek, seeds_from
 from hindrl_jax.config import SWEEPABLE, TrainConfig, without_effect
 from hindrl_jax.conversion import MINARI_PREFIX, load
 from hindrl_jax.errors import UserError, one_line
-from hindrl_jax.experiment import Diverged, Result, check_trainable, fit, record_demonstrations
+from hindrl_jax.experiment import Diverged, Result, check_goals, check_trainable, fit, record_demonstrations
 from hindrl_jax.presets import ORIGINAL_RULES, Preset, preset
 from hindrl_jax.progress import ProgressBar
-from hindrl_jax.registry import TASKS, checked, did_you_mean, make, task
+from hindrl_jax.registry import checked, did_you_mean, make, task
 from hindrl_jax.reporters import REPORTERS, Reporter
 from hindrl_jax.runs import CHECKPOINTS, FROM_PYTHON, SUMMARY, SWEEP, RunSpec, RunWriter, SweepWriter, read_spec, read_sweep, summarise
 from hindrl_jax.types import Episodes
@@ -168,7 +168,7 @@ def _reporters(options: TrainOptions | ResumeOptions, resumed: Path | None = Non
 
 
 def _default_out(spec: RunSpec, *words: str) -> Path:
-    return Path("runs") / "_".join([spec.env.name, spec.config.algo, *words, time.strftime("%Y%m%d_%H%M%S")])
+    return Path("runs") / "_".join([re.sub(r"[:/]", "_", spec.env.name), spec.config.algo, *words, time.strftime("%Y%m%d_%H%M%S")])
 
 
 def _grid(over: Sequence[str], config: TrainConfig) -> Iterator[dict[str, float]]:
@@ -341,7 +341,7 @@ def parse_train(arguments: list[str], options_class: type[TrainOptions] = TrainO
 
     environment_class = type(spec.env)
     fields = [
-        ("env", Literal[tuple(TASKS)], spec.env.name, "The environment; `hindrl envs` lists them."),
+        ("env", env_names(spec.env.name), spec.env.name, ENV_HELP),
         ("preset", Preset, chosen["preset"] or "default", "Where the other defaults come from: our recipe, the thesis, or its original code."),
         ("config", Path | None, None, "Run again what a config.json (or the directory of a run) says; other flags change it."),
         ("resume", Path | None, None, "Go on with the run, or sweep, of a directory that was stopped or killed, as if it had never been."),
@@ -356,6 +356,7 @@ def parse_train(arguments: list[str], options_class: type[TrainOptions] = TrainO
     )
     parsed = parse(namespace, arguments, program, train.__doc__ if options_class is TrainOptions else sweep.__doc__)
     check_trainable(parsed.environment)
+    check_goals(parsed.environment, parsed.training)
     _warn_of_what_has_no_effect(spec.config, parsed.training)
     options = parsed.options
     seeds = spec.seeds

@@ -129,3 +129,14 @@ def test_a_state_survives_the_way_through_a_vector(env):
     state, _ = jax.eval_shape(env.reset, jax.random.key(0))
     vector = jax.eval_shape(env.state_to_vector, state)
     assert (vector.shape, vector.dtype) == ((env.state_dim,), jnp.float32)
+
+
+@every_environment
+def test_observations_stay_within_their_bounds(env):
+    first, steps, _ = episodes(env)
+    low, high = env.observation_low, env.observation_high
+    assert low.shape == high.shape == (env.observation_dim,)
+    assert low.dtype == high.dtype == np.float32
+    for observations in (first, steps.observation):
+        assert (observations >= low - 1e-5).all()
+        assert (observations <= high + 1e-5).all()

@@ -1,0 +1,279 @@
+"""Our environments as Gymnasium's: `gymnasium.make("hindrl/FixedGridPickAndPlace-v0")` and `gymnasium.make_vec` of the same.
+
+Observations are dictionaries of `observation`, `achieved_goal` and `desired_goal`, as goal-conditioned learners expect them (Stable-Baselines3's HER,
+for one), all float32 within bounds.
+
+  * Actions are in [-1, 1], the range of the policies and of demonstrations on disk, not in the units of the environment itself.
+  * The desired goal is the same in every episode: `env.task_goal()`, which says that the task is solved, not where things are. Where they are to
+    be brought is part of the observation, or, in the fixed reach task, is not observed at all.
+  * The reward is the environment's own: 1 at the step that solves the task, else 0. That step terminates the episode. The horizon truncates it: it
+    is Gymnasium's `max_episode_steps`.
+  * compute_reward(achieved_goal, desired_goal, info) is 1 where |achieved - desired| <= `env.goal_tolerance` in every dimension. For the desired goal
+    it agrees with the reward of every step; an environment with rules under which it could not is refused.
+  * info["is_success"] says whether the episode was solved at this step.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from gymnasium.spaces import Box, Dict
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from experts.recording import on_host
+from hindrl_jax.errors import UserError
+from hindrl_jax.registry import make, viewer
+from hindrl_jax.types import Array, RestorableEnvironment, action_to_env, compiler_options, tree_where
+
+Observation = dict[str, np.ndarray]
+_NEVER = 2**31 - 1  # the horizon of an environment that nobody, or somebody else, cuts
+
+
+class _GoalTask:
+    """What one environment and many side by side have in common: the environment, its spaces, and the goal test."""
+
+    def __init__(self, name: str, horizon: int, arguments: dict[str, Any], render_mode: str | None):
+        if "horizon" in arguments:
+            raise UserError(f"horizon = {arguments['horizon']} is not for Gymnasium, which has max_episode_steps: give that")
+        env = make(name, horizon=horizon, **arguments)
+        if on_host(env):
+            raise UserError(f"{name} cannot be stepped here with backend = 'robosuite': choose 'closed_form' or 'mjx'")
+        if env.goal_tolerance is None:
+            given = ", ".join(f"{key} = {value!r}" for key, value in arguments.items())
+            raise UserError(
+                f"{name} with {given} is solved in states that no goal tells from others, so compute_reward cannot be had: leave that out"
+            )
+        if render_mode not in (None, "rgb_array"):
+            raise UserError(f"render_mode = {render_mode!r} is not usable: choose 'rgb_array' or None")
+        self.env = env
+        self.goal, self.tolerance = np.asarray(env.task_goal()), env.goal_tolerance
+        low, high = env.observation_low, env.observation_high
+        goals = Box(*(np.asarray(env.achieved_goal(bound)) for bound in (low, high)), dtype=np.float32)  # a goal is some entries of an observation
+        self.observation_space = Dict(observation=Box(low, high, dtype=np.float32), achieved_goal=goals, desired_goal=goals)
+        self.action_space = Box(-1.0, 1.0, (env.action_dim,), np.float32)
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": env.render_fps}
+
+    def unpack(self, rows: Any) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray]:
+        """What `_pack` put together, in memory of its own: rows (..., D + G + 3) -> observation, reward, terminated, truncated."""
+        dims = np.cumsum([self.env.observation_dim, self.env.goal_dim])
+        observation, achieved_goal, rest = (part.copy() for part in np.split(np.asarray(rows), dims, axis=-1))
+        desired_goal = np.broadcast_to(self.goal, achieved_goal.shape).copy()
+        named = {"observation": observation, "achieved_goal": achieved_goal, "desired_goal": desired_goal}
+        return named, rest[..., 0], rest[..., 1] > 0.0, rest[..., 2] > 0.0
+
+    def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> np.ndarray:
+        """1 where the goal is reached, else 0: goals (..., G) -> (...) float32. `info` is not used."""
+        del info
+        return np.all(np.abs(np.asarray(achieved_goal) - desired_goal) <= self.tolerance, axis=-1).astype(np.float32)
+
+    def picture(self, state: Any) -> np.ndarray:
+        """(H, W, 3) uint8."""
+        return viewer(self.env).frame(self.env, state)
+
+
+def _pack(env: RestorableEnvironment, observation: Array, *results: Array | float) -> Array:
+    """(D + G + 3,) all that a step has to say as one row of numbers, since every array on its way out of JAX takes its time."""
+    observation = jnp.clip(observation, env.observation_low, env.observation_high)  # only rounding leads out of the bounds
+    return jnp.concatenate([observation, env.achieved_goal(observation), jnp.stack([jnp.asarray(result, jnp.float32) for result in results])])
+
+
+def _start(env: RestorableEnvironment, seed: Array, episode: Array) -> tuple[Any, Array]:
+    """The first state and row of one of a seed's episodes, counted from 0."""
+    state, observation = env.reset(jax.random.fold_in(jax.random.key(seed), episode))
+    return state, _pack(env, observation, 0.0, 0.0, 0.0)
+
+
+def _step(env: RestorableEnvironment, state: Any, action: Array) -> tuple[Any, Array]:
+    state, time_step = env.step(state, action_to_env(jnp.clip(action, -1.0, 1.0), env))
+    return state, _pack(env, time_step.observation, time_step.reward, time_step.terminated, time_step.truncated)
+
+
+def _draw_seed(generator: np.random.Generator) -> int:
+    return int(generator.integers(2**32))
+
+
+@functools.cache
+def _programs(env: RestorableEnvironment) -> tuple[Any, Any]:
+    """`_start` and `_step`, compiled once for all environments that are equal."""
+    return tuple(jax.jit(functools.partial(function, env), compiler_options=compiler_options(env)) for function in (_start, _step))
+
+
+class GoalEnv(gymnasium.Env[Observation, np.ndarray]):
+    """One environment. It is computed on the CPU: one alone would only wait for a GPU.
+
+    Args:
+      name: of the environment, as in `hindrl_jax.make`.
+      render_mode: None, or "rgb_array".
+      **arguments: fields of the environment but `horizon`, which is Gymnasium's `max_episode_steps`.
+
+    Raises:
+      UserError: for a name, an argument or a render mode that does not exist, or rules under which there is no `compute_reward`.
+    """
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012, as Gymnasium reads it off the class
+
+    def __init__(self, name: str, *, render_mode: str | None = None, **arguments: Any):
+        self._task = _GoalTask(name, _NEVER, arguments, render_mode)
+        self.observation_space, self.action_space = self._task.observation_space, self._task.action_space
+        self.metadata, self.render_mode = self._task.metadata, render_mode
+        self._start, self._step = _programs(self._task.env)
+        self._cpu = jax.devices("cpu")[0]
+        self._seed: int | None = None
+        self._episode = 0
+        self._state: Any = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
+        """Starts an episode: the first of the seed's episodes, or without a seed the next."""
+        super().reset(seed=seed)
+        if seed is not None or self._seed is None:
+            self._seed, self._episode = _draw_seed(self.np_random), 0
+        else:
+            self._episode += 1
+        with jax.default_device(self._cpu):
+            self._state, row = self._start(np.uint32(self._seed), np.int32(self._episode))
+        return self._task.unpack(row)[0], {"is_success": False}
+
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Takes one step: action (A,), clipped to [-1, 1]."""
+        with jax.default_device(self._cpu):
+            self._state, row = self._step(self._state, np.asarray(action, np.float32))
+        observation, reward, terminated, truncated = self._task.unpack(row)
+        return observation, float(reward), bool(terminated), bool(truncated), {"is_success": bool(terminated)}
+
+    def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> np.ndarray:
+        """1 where the goal is reached, else 0: goals (..., G) -> (...) float32. `info` is not used."""
+        return self._task.compute_reward(achieved_goal, desired_goal, info)
+
+    def render(self) -> np.ndarray | None:
+        """A picture (H, W, 3) uint8 of the present state; None without a render mode."""
+        return None if self.render_mode is None else self._task.picture(self._state)
+
+
+@struct.dataclass(kw_only=True)
+class _Lives:
+    """E environments side by side."""
+
+    states: Any  # leaves (E, ...)
+    rows: Array  # (E, D + G + 3), what was said last
+    seeds: Array  # (E,) uint32
+    episodes: Array  # (E,) int32, which of the seed's episodes this is
+
+
+@functools.cache
+def _vector_programs(env: RestorableEnvironment, mode: AutoresetMode) -> tuple[Any, Any, Any]:
+    """The compiled start, restart and step of E environments."""
+
+    def start(seeds: Array, episodes: Array) -> _Lives:
+        states, rows = jax.vmap(functools.partial(_start, env))(seeds, episodes)
+        return _Lives(states=states, rows=rows, seeds=seeds, episodes=episodes)
+
+    def restart(lives: _Lives, chosen: Array, seeds: Array, is_new: Array) -> _Lives:
+        """New episodes where `chosen`: the next ones, or where the seed is new its first."""
+        return tree_where(chosen, start(jnp.where(is_new, seeds, lives.seeds), jnp.where(is_new, 0, lives.episodes + 1)), lives)
+
+    def step(lives: _Lives, actions: Array) -> tuple[_Lives, Array]:
+        """The environments after the step, and the rows before any of them began anew at its end."""
+        states, rows = jax.vmap(functools.partial(_step, env))(lives.states, actions)
+        stepped = lives.replace(states=states, rows=rows)
+        if mode is AutoresetMode.DISABLED:
+            return stepped, rows
+        ended = jnp.any((lives.rows if mode is AutoresetMode.NEXT_STEP else rows)[:, -2:] > 0.0, axis=1)
+        anew = restart(stepped, ended, lives.seeds, jnp.zeros_like(ended))
+        if mode is AutoresetMode.SAME_STEP:  # with the observation that begins an episode goes the reward that ended the one before
+            anew = anew.replace(rows=jnp.concatenate([anew.rows[:, :-3], rows[:, -3:]], axis=1))
+        return anew, rows
+
+    return tuple(jax.jit(function, compiler_options=compiler_options(env)) for function in (start, restart, step))
+
+
+class GoalVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
+    """E environments in one compiled program, on JAX's default device.
+
+    Given the same seed, its episodes are those of E single environments (`vectorization_mode="sync"`).
+
+    Args:
+      name, render_mode, arguments: as for `GoalEnv`.
+      num_envs: E.
+      max_episode_steps: number of steps after which an episode is truncated; None is never.
+      autoreset_mode: when an ended episode gives way to the next. "NextStep", Gymnasium's default: at the next step, whose action is ignored.
+        "SameStep": at once; its last observation is in info["final_obs"]. "Disabled": by `reset`, with options {"reset_mask": (E,) bool}.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        num_envs: int = 1,
+        max_episode_steps: int | None = None,
+        render_mode: str | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        **arguments: Any,
+    ):
+        super().__init__()
+        self._task = _GoalTask(name, max_episode_steps or _NEVER, arguments, render_mode)
+        self.num_envs, self.render_mode = num_envs, render_mode
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {**self._task.metadata, "autoreset_mode": self.autoreset_mode}
+        self.single_observation_space, self.single_action_space = self._task.observation_space, self._task.action_space
+        self.observation_space, self.action_space = (
+            batch_space(space, num_envs) for space in (self.single_observation_space, self.single_action_space)
+        )
+        self._start, self._restart, self._step = _vector_programs(self._task.env, self.autoreset_mode)
+        self._lives: _Lives | None = None
+
+    def reset(self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
+        """Starts episodes everywhere, or where options["reset_mask"] (E,) says so.
+
+        Args:
+          seed: environment i gets seed + i, or item i of a sequence; without, each goes on to the next episode of the seed that it has.
+          options: see above.
+        """
+        super().reset(seed=seed if isinstance(seed, int) else None)
+        of_each = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else [None] * self.num_envs if seed is None else list(seed)
+        if len(of_each) != self.num_envs:
+            raise UserError(f"{len(of_each)} seeds for {self.num_envs} environments: give one for each, or a single number")
+        is_new = np.array([one is not None or self._lives is None for one in of_each])
+        seeds = np.array([_draw_seed(self.np_random if one is None else seeding.np_random(one)[0]) for one in of_each], np.uint32)
+        chosen = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, bool)), bool)
+        if self._lives is None:
+            self._lives = self._start(seeds, np.zeros(self.num_envs, np.int32))
+        else:
+            self._lives = self._restart(self._lives, chosen, seeds, is_new)
+        return self._task.unpack(self._lives.rows)[0], self._info(np.zeros(self.num_envs, bool), chosen)
+
+    def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Takes one step of all: actions (E, A), clipped to [-1, 1]."""
+        self._lives, rows = self._step(self._lives, np.asarray(actions, np.float32))
+        observation, reward, terminated, truncated = self._task.unpack(self._lives.rows)
+        ended = terminated | truncated
+        if self.autoreset_mode is not AutoresetMode.SAME_STEP or not ended.any():
+            return observation, reward.astype(np.float64), terminated, truncated, self._info(terminated)
+        final, *_ = self._task.unpack(rows)
+        final_obs = np.full(self.num_envs, None, object)
+        for i in np.flatnonzero(ended):
+            final_obs[i] = {name: values[i] for name, values in final.items()}
+        info = {"final_obs": final_obs, "_final_obs": ended, "final_info": self._info(terminated, ended), "_final_info": ended}
+        return observation, reward.astype(np.float64), terminated, truncated, self._info(terminated & ~ended) | info
+
+    def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> np.ndarray:
+        """As of `GoalEnv`."""
+        return self._task.compute_reward(achieved_goal, desired_goal, info)
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """A picture (H, W, 3) uint8 of each environment; None without a render mode."""
+        if self.render_mode is None:
+            return None
+        states = jax.device_get(self._lives.states.replace(key=None))
+        return tuple(self._task.picture(jax.tree.map(lambda leaf, i=i: leaf[i], states)) for i in range(self.num_envs))
+
+    def _info(self, is_success: np.ndarray, present: np.ndarray | None = None) -> dict[str, np.ndarray]:
+        return {"is_success": is_success, "_is_success": np.ones(self.num_envs, bool) if present is None else present}

@@ -1,0 +1,59 @@
+"""The experts of the Fetch tasks, in the real environments."""
+
+import numpy as np
+import pytest
+
+import hindrl_jax as hindrl
+from experts.fetch import FetchPickAndPlaceExpert, FetchReachExpert
+from hindrl_jax.errors import UserError
+from hindrl_jax.from_gymnasium import Simulators
+from hindrl_jax.registry import task
+
+pytest.importorskip("gymnasium_robotics")
+
+
+@pytest.mark.parametrize(
+    ("name", "expert", "dims"),
+    [("gymnasium:FetchReach-v4", FetchReachExpert, (13, 3, 4)), ("gymnasium:FetchPickAndPlace-v4", FetchPickAndPlaceExpert, (28, 3, 4))],
+)
+def test_demonstrations_reach_their_goals_soon(name, expert, dims):
+    env = hindrl.make(name)
+    assert task(name).expert is expert
+    assert (env.observation_dim, env.goal_dim, env.action_dim) == dims
+    assert env.horizon == 50
+    np.testing.assert_allclose(env.goal_tolerance, 0.05 / 3**0.5)
+    demonstrations = hindrl.record_demonstrations(env, 6)
+    last = demonstrations.observations[np.arange(6), demonstrations.lengths]
+    assert (np.linalg.norm(env.achieved_goal(last) - demonstrations.desired_goals, axis=1) <= 0.05).all()
+    assert demonstrations.lengths.max() <= 45
+    assert np.abs(demonstrations.actions).max() <= 1.0
+
+
+@pytest.mark.parametrize("expert", [FetchReachExpert(noise=0.0), FetchPickAndPlaceExpert(noise=0.0)])
+def test_without_noise_nearly_every_episode_is_solved(expert):
+    """The recorder gives up after as many episodes as there are demonstrations and one."""
+    env = hindrl.make(f"gymnasium:{expert.tasks}-v4")
+    hindrl.record_gymnasium(env, expert.act, 8, seed=1, max_attempts=9)
+
+
+def test_noise_must_not_be_negative():
+    with pytest.raises(ValueError, match="noise"):
+        FetchReachExpert(noise=-1.0)
+
+
+def test_a_task_without_expert_says_what_to_do():
+    with pytest.raises(UserError, match="record_gymnasium"):
+        hindrl.record_demonstrations(hindrl.make("gymnasium:FetchPush-v4"), 1)
+
+
+def test_it_draws_itself():
+    simulators = Simulators(hindrl.make("gymnasium:FetchReach-v4"), 1, render_mode="rgb_array")
+    simulators.begin(np.array([0]))
+    try:
+        picture = simulators.picture()
+    except UserError as error:
+        pytest.skip(str(error))
+    finally:
+        simulators.close()
+    assert picture.shape == (480, 480, 3)
+    assert picture.std() > 10
