@@ -699,7 +699,7 @@ def test_the_agent_begins_anew_once_and_the_replay_stays(data):
     run = jax.jit(functools.partial(train.learn, env=make_env(), config=config, num_iterations=LEARN_STEPS), compiler_options=FAST_COMPILATION)
     steps, states = [], [collected(0, data)]
     for _ in range(3):
-        state, metrics = run(states[-1], data)
+        state, _ = run(states[-1], data)
         states.append(state)
         steps.append((int(state.env_steps), int(state.resets), int(state.updates_at_reset), int(state.agent.actor_optimiser.count)))
     # The second call begins at step 51, so its 6 updates are the first ones of the new agent; the third goes on with it.
