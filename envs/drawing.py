@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import lru_cache
 from os import PathLike
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -33,7 +33,7 @@ _MAX_EXACT = 128  # colours kept exactly, at most
 @lru_cache(maxsize=64)
 def font(size: int) -> ImageFont.FreeTypeFont:
     """The font of all text, by its size in pixels."""
-    return ImageFont.load_default(size)
+    return cast(ImageFont.FreeTypeFont, ImageFont.load_default(size))  # with a size it is of that kind
 
 
 def tick(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float) -> None:
@@ -61,7 +61,7 @@ def caption_strip(width: int, title: str, progress: str, *, solved: bool) -> np.
         pixels = size * SUPERSAMPLING
         wide = font(pixels).getlength(line)
         pixels = max(1, int(pixels * min(1.0, max_width * SUPERSAMPLING / max(wide, 1.0))))
-        draw.text([v * SUPERSAMPLING for v in position], line, font=font(pixels), fill=colour, anchor=anchor)
+        draw.text((position[0] * SUPERSAMPLING, position[1] * SUPERSAMPLING), line, font=font(pixels), fill=colour, anchor=anchor)
 
     text((MARGIN, 0), title, 17, INK, width - 2 * MARGIN)
     text((MARGIN, 25), progress, 15, FAINT_INK, width // 2)
@@ -70,7 +70,7 @@ def caption_strip(width: int, title: str, progress: str, *, solved: bool) -> np.
     return np.asarray(image.reduce(SUPERSAMPLING))
 
 
-def captioned_states(states: Any, captions: Sequence[str] | None, state_type: type) -> list[tuple[Any, str]]:
+def captioned_states(states: Any, captions: Sequence[str] | None, state_type: type[Any]) -> list[tuple[Any, str]]:
     """Pairs each state of an episode with its caption.
 
     Args:

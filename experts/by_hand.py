@@ -109,7 +109,7 @@ class _Hand:
         self._moved, self._due = False, time.monotonic()
         device.start_control()
 
-    def __call__(self, key: Array, state: Any, observation: Array) -> np.ndarray:
+    def __call__(self, key: Array, state: Any, observation: Array) -> Any:
         """Waits for the next step's turn, and at the beginning of the episode for a movement; returns the action (6,)."""
         del key, state, observation
         while True:

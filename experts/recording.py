@@ -41,7 +41,8 @@ def play(key: Array, env: RestorableEnvironment, act: Act, num_episodes: int) ->
         next_state, time_step = env.step(state, action)
         next_state = tree_where(over, state, next_state)
         next_observation = jnp.where(over, observation, time_step.observation)
-        row = (observation, env.state_to_vector(state), action_from_env(action, env), time_step.reward, over, time_step.terminated)
+        done = jnp.clip(action_from_env(action, env), -1.0, 1.0)  # what the environment makes of an action beyond its bounds
+        row = (observation, env.state_to_vector(state), done, time_step.reward, over, time_step.terminated)
         return (key, next_state, next_observation, over | time_step.terminated | time_step.truncated), row
 
     def episode(key: Array) -> Episodes:
@@ -63,7 +64,7 @@ def play(key: Array, env: RestorableEnvironment, act: Act, num_episodes: int) ->
     return jax.vmap(episode)(jax.random.split(key, num_episodes))
 
 
-def on_host(env: RestorableEnvironment) -> bool:
+def on_host(env: Any) -> bool:
     """Whether the environment is simulated outside JAX, by robosuite: one episode after the other, and never inside a compiled program."""
     return getattr(env, "backend", None) == "robosuite"
 
@@ -78,7 +79,8 @@ def player(env: RestorableEnvironment, act: Act, num_episodes: int) -> Callable[
       UserError: from the program, if the environment is simulated by robosuite and that is missing or unusable.
     """
     if on_host(env):
-        return lambda key: play_in_robosuite(key, env, act, num_episodes)
+        arm: Any = env
+        return lambda key: play_in_robosuite(key, arm, act, num_episodes)
     return jax.jit(lambda key: play(key, env, act, num_episodes), compiler_options=compiler_options(env))
 
 
@@ -105,7 +107,8 @@ def record(key: Array, env: RestorableEnvironment, expert: Expert, num_demos: in
     max_attempts = 100 * num_demos if max_attempts is None else max_attempts
     batch_size = 1 if on_host(env) else max(num_demos, 16)
     play_batch = _expert_player(env, expert, batch_size)
-    kept, attempts = [], 0
+    kept: list[Episodes] = []
+    attempts = 0
     while sum(len(batch.lengths) for batch in kept) < num_demos:
         if attempts >= max_attempts:
             found = sum(len(batch.lengths) for batch in kept)

@@ -380,21 +380,21 @@ def play_episode(key: Array, env: ReachEnvironment, arm: RobosuiteArm, act: Act)
         if time_step.terminated or time_step.truncated:
             break
 
-    def repeated(rows: list[Array]) -> np.ndarray:
+    def repeated(rows: list[Array]) -> Any:
         return np.stack(jax.device_get(rows + rows[-1:] * (env.horizon + 1 - len(rows))))
 
-    def padded(rows: list[Array]) -> np.ndarray:
+    def padded(rows: list[Array]) -> Any:
         array = np.stack(jax.device_get(rows))
         return np.concatenate([array, np.zeros((env.horizon - len(rows), *array.shape[1:]), array.dtype)])
 
+    ends: dict[str, Any] = dict(lengths=np.int32(len(actions)), terminated=np.bool_(time_step.terminated))
     return Episodes(
         observations=repeated(observations),
         actions=padded(actions),
         rewards=padded(rewards),
-        lengths=np.int32(len(actions)),
-        terminated=np.bool_(time_step.terminated),
-        desired_goals=np.asarray(env.achieved_goal(observation)),
+        desired_goals=jax.device_get(env.achieved_goal(observation)),
         states=repeated(states),
+        **ends,
     )
 
 

@@ -34,6 +34,7 @@ _EXPORTS = {
     "preset": "hindrl_jax.presets",
     "record_demonstrations": "hindrl_jax.experiment",
     "record_gymnasium": "hindrl_jax.host",
+    "register": "hindrl_jax.registry",
     "save_demonstrations": "hindrl_jax.datasets",
     "save_run": "hindrl_jax.runs",
 }

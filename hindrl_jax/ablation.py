@@ -1,9 +1,9 @@
 """Ablation: the default recipe of the grid tasks with one change at a time, on several tasks, with the same seeds for every change.
 
-OUT/TASK/LEVER/    an ordinary run's directory for each setting; OUT/TASK/default/ is the recipe as it is, the baseline
-ablation.csv       a row for each setting
-ablation.md        the same for people: a table for each task
-ablation.png       the differences to the baseline
+    OUT/TASK/LEVER/    an ordinary run's directory for each setting; OUT/TASK/default/ is the recipe as it is, the baseline
+    ablation.csv       a row for each setting
+    ablation.md        the same for people: a table for each task
+    ablation.png       the differences to the baseline
 
 The tables are made from the directories alone, so they can be made again, and an ablation that was interrupted goes on where it was.
 """

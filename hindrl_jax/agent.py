@@ -27,8 +27,7 @@ from hindrl_jax.types import Array, Transition, tree_where
 Metrics = dict[str, Array]
 
 
-@struct.dataclass(kw_only=True)
-class AgentState:
+class AgentState(struct.PyTreeNode, kw_only=True):
     """Everything the agent learns."""
 
     actor: Params
@@ -48,8 +47,7 @@ _ADAM = optax.scale_by_adam()  # the step size is applied apart, since it may ch
 _LEAST_EXTENT = 1e-6
 
 
-@struct.dataclass(kw_only=True)
-class InputScale:
+class InputScale(struct.PyTreeNode, kw_only=True):
     """Where each input dimension lies in the demonstrations and how large it is; the encodings other than raw see (x - centre) / scale."""
 
     observation: Array  # (D,) scale, > 0
@@ -144,8 +142,7 @@ def select_action(key: Array, actor: Params, inputs: Array, config: AgentConfig,
     return jnp.clip(distribution.mode.T + config.exploration_noise * jax.random.normal(key, (inputs.shape[0], action_dim)), -1.0, 1.0)
 
 
-@struct.dataclass(kw_only=True)
-class Schedule:
+class Schedule(struct.PyTreeNode, kw_only=True):
     """What changes along a run."""
 
     learning_rate: Array | float  # () step size of Adam
@@ -183,8 +180,7 @@ def _descend(
     return jax.tree.map(lambda param, update: param - learning_rate * update, params, updates), optimiser_state
 
 
-@struct.dataclass(kw_only=True)
-class _Columns:
+class _Columns(struct.PyTreeNode, kw_only=True):
     """A batch as networks and losses take it: one column per transition."""
 
     inputs: Array  # (input_dim, B)

@@ -114,7 +114,7 @@ class BatchConfig:
         return int(self.max_demo_ratio * self.batch_size)
 
     @property
-    def sources(self) -> tuple[tuple[Source, Any], ...]:
+    def sources(self) -> tuple[tuple[Any, Any], ...]:
         """The sources of relabelled goals and their weights, which need not sum to 1; none if nothing is relabelled."""
         if self.num_sampled_goals == 0:
             return ()
@@ -342,7 +342,7 @@ class TrainConfig:
         if self.demo_reset_curriculum > 0.0 and self.demo_reset_ratio == 0.0:
             raise ValueError(f"demo_reset_curriculum = {self.demo_reset_curriculum} is of no use while demo_reset_ratio = 0: raise that, too")
         if self.algo == "bc":
-            given = {"bc_warm_start": self.bc_warm_start, "pretrain_updates": self.pretrain_updates, "q_filter": self.agent.q_filter}
+            given: dict[str, Any] = {"bc_warm_start": self.bc_warm_start, "pretrain_updates": self.pretrain_updates, "q_filter": self.agent.q_filter}
             given |= {"priority_exponent": self.batch.priority_exponent, "base": self.agent.base != "tqc" and self.agent.base}
             for name, value in given.items():
                 if value:

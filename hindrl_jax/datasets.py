@@ -37,12 +37,13 @@ import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import h5py
 import numpy as np
 
 from hindrl_jax.errors import UserError, one_line
+from hindrl_jax.registry import full_name
 from hindrl_jax.types import Episodes, RestorableEnvironment
 
 FORMAT_VERSION = 1
@@ -154,7 +155,7 @@ def save_demonstrations(
       ValueError: the episodes have no states, or not those of the environment.
     """
     path = Path(path)
-    table = Episodes(**{field.name: np.asarray(getattr(demonstrations, field.name)) for field in dataclasses.fields(Episodes)})
+    table: Any = Episodes(**{field.name: cast(Any, np.asarray(getattr(demonstrations, field.name))) for field in dataclasses.fields(Episodes)})
     expected = (*table.observations.shape[:2], env.state_dim)
     if table.states.shape != expected:
         raise ValueError(f"states must have shape {expected}, found {table.states.shape}")
@@ -172,7 +173,8 @@ def save_demonstrations(
         )
         for i, length in enumerate(table.lengths.tolist())
     )
-    write_recording(path, Recording(env_name=env.name, env_kwargs=env_args, expert=expert, demonstrations=recorded), env=env, overwrite=overwrite)
+    recording = Recording(env_name=full_name(env), env_kwargs=env_args, expert=expert, demonstrations=recorded)
+    write_recording(path, recording, env=env, overwrite=overwrite)
 
 
 def write_recording(path: str | os.PathLike[str], recording: Recording, *, env: RestorableEnvironment | None = None, overwrite: bool = False) -> None:
@@ -363,7 +365,7 @@ def padded(rows: Sequence[np.ndarray], num_rows: int) -> np.ndarray:
 
 def _table(demos: Sequence[Demonstration], horizon: int) -> Episodes:
     with_states = all(demo.states is not None for demo in demos)
-    return Episodes(
+    table: dict[str, Any] = dict(
         observations=padded([demo.observations for demo in demos], horizon + 1),
         actions=padded([demo.actions for demo in demos], horizon),
         rewards=padded([demo.rewards for demo in demos], horizon),
@@ -372,6 +374,7 @@ def _table(demos: Sequence[Demonstration], horizon: int) -> Episodes:
         desired_goals=np.stack([demo.desired_goal for demo in demos]).astype(np.float32),
         states=padded([demo.states for demo in demos], horizon + 1) if with_states else None,
     )
+    return Episodes(**table)
 
 
 def read_recording(path: str | os.PathLike[str]) -> Recording:
@@ -572,7 +575,7 @@ def _read_demonstration(path: Path, name: str, group: h5py.Group, length: int, *
 
 
 def _check_against_env(path: Path, env_name: str, env_kwargs: dict[str, Any], demos: Sequence[Demonstration], env: RestorableEnvironment) -> None:
-    if env_name != env.name:
+    if env.name not in (env_name, env_name.rpartition(":")[2]):  # the module of a task of the user's own may have moved
         raise UserError(f"{path}: was recorded in {env_name}, not in {env.name}; name a file of {env.name} or train in {env_name}")
     if dataclasses.is_dataclass(env):
         expected, missing = plain(dataclasses.asdict(env)), "nothing"
@@ -591,7 +594,8 @@ def _check_against_env(path: Path, env_name: str, env_kwargs: dict[str, Any], de
                 raise UserError(f"{path}: {demo.name}: {what} have {found} dimensions, but {dim} in {env.name}; {_RECORD_AGAIN}")
     # One call for the whole file: under JAX, one per demonstration would compile for every length.
     owners = np.repeat(np.arange(len(demos)), [len(demo.observations) for demo in demos])
-    expected_goals = np.asarray(env.achieved_goal(np.concatenate([demo.observations for demo in demos])))
+    observations: Any = np.concatenate([demo.observations for demo in demos])
+    expected_goals = np.asarray(env.achieved_goal(observations))
     stored_goals = np.concatenate([demo.achieved_goals for demo in demos])
     wrong = ~np.isclose(stored_goals, expected_goals, rtol=_GOAL_TOLERANCE, atol=_GOAL_TOLERANCE).all(axis=1)
     if wrong.any():

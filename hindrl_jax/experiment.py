@@ -144,14 +144,14 @@ class Result:
             seed=seed,
             final_success=float(self.final_success[index]),
             best_success=max(float(self.final_success[index]), *(row.success for row in rows)),
-            env_steps_to_95=first and first.env_steps,
-            updates_to_95=first and first.updates,
-            seconds_to_95=first and first.seconds,
+            env_steps_to_95=None if first is None else first.env_steps,
+            updates_to_95=None if first is None else first.updates,
+            seconds_to_95=None if first is None else first.seconds,
             episode_length=float(self.final_length[index]),
         )
 
 
-def record_demonstrations(env: RestorableEnvironment, num_demos: int, *, seed: int = 0, expert: Any = None) -> Episodes:
+def record_demonstrations(env: Any, num_demos: int, *, seed: int = 0, expert: Any = None) -> Episodes:
     """Records demonstrations with the task's own expert.
 
     Args:
@@ -161,12 +161,12 @@ def record_demonstrations(env: RestorableEnvironment, num_demos: int, *, seed: i
       expert: another expert: a frozen dataclass with a method act(key, env, state), for Gymnasium's environments act(observation, rng).
 
     Raises:
-      UserError: if `num_demos` is below 1 or the expert cannot solve the task within its horizon.
+      UserError: if `num_demos` is below 1, the expert cannot solve the task within its horizon, or there is none.
     """
     if expert is None:
         expert_class = task(env.name).expert
         if expert_class is None:
-            raise UserError(f"no expert is known for {env.name}: give demonstrations from a file, which hindrl_jax.record_gymnasium can make")
+            raise UserError(f"no expert is known for {env.name}: give one, or demonstrations from a file, which hindrl_jax.record_gymnasium can make")
         expert = expert_class()
     if is_gymnasium(env):
         return record_gymnasium(env, expert.act, num_demos, seed=seed)
@@ -354,7 +354,7 @@ def _demonstrations_per_seed(demonstrations: Episodes | Sequence[Episodes], seed
         if table.states is not None and table.states.shape != (*table.observations.shape[:2], env.state_dim):
             raise UserError(f"demonstrated states of shape {table.states.shape} are not those of {env.name}, which has {env.state_dim}: record again")
     if any(table.states is None for table in tables):
-        tables = [table.replace(states=None) for table in tables]
+        tables = tuple(table.replace(states=None) for table in tables)
     return jax.tree.map(lambda *leaves: np.stack(leaves), *jax.device_get(tables))
 
 
@@ -375,7 +375,7 @@ def _swept_fields(configs: Sequence[TrainConfig]) -> list[str]:
     return [name for name in SWEEPABLE if len({sweepable_value(config, name) for config in configs}) > 1]
 
 
-def _programs(env: RestorableEnvironment, configs: Sequence[TrainConfig], demonstrations: Episodes) -> _Programs | HostPrograms:
+def _programs(env: Any, configs: Sequence[TrainConfig], demonstrations: Episodes) -> _Programs | HostPrograms:
     if not is_gymnasium(env):
         return _Programs(env, configs, demonstrations)
     warm_up, chunk, values = _extent(env, configs)
@@ -384,7 +384,7 @@ def _programs(env: RestorableEnvironment, configs: Sequence[TrainConfig], demons
     return programs
 
 
-def _extent(env: RestorableEnvironment, configs: Sequence[TrainConfig]) -> tuple[int, int, dict[str, np.ndarray]]:
+def _extent(env: Any, configs: Sequence[TrainConfig]) -> tuple[int, int, dict[str, np.ndarray]]:
     """Iterations of the random steps at the start and of a chunk, and the swept values (S,) of the configs."""
     config = configs[0]
     warm_up, per_iteration = (0, 1) if config.algo == "bc" else (training.warm_up_iterations(env, config), config.num_envs)
@@ -448,8 +448,8 @@ class _Programs:
             collecting = None if cloning else compiled(program(collect, donate=True).trace(state, guidance, values), _RUN_ONCE)
             pretrains = not cloning and config.bc_warm_start + config.pretrain_updates > 0
             pretraining = compiled(program(pretrain, donate=True).trace(state, guidance, values)) if pretrains else None
-        self.start, self.learn, self.collect = starting.result(), learning.result(), collecting and collecting.result()
-        self.pretrain = pretraining and pretraining.result()
+        self.start, self.learn, self.collect = starting.result(), learning.result(), collecting.result() if collecting else None
+        self.pretrain = pretraining.result() if pretraining else None
         self.evaluate, self.evaluate_fresh = evaluating[config.eval_episodes].result(), evaluating[FRESH_EPISODES].result()
 
 

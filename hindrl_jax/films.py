@@ -48,6 +48,8 @@ def save_film(env: RestorableEnvironment, episodes: Sequence[Sequence[Any]], pat
     from envs import drawing  # not with this module: it loads Pillow, which only drawing needs
 
     draw = viewer(env)
+    if draw is None:
+        raise UserError(f"{env.name} has no viewer to draw it: give one to hindrl_jax.register")
     if path.suffix == ".png":
         draw.save_png(env, episodes[-1][-1], path)
         return

@@ -20,7 +20,7 @@ import functools
 import importlib
 import json
 import os
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, TypeGuard
 
 import numpy as np
 from gymnasium.spaces import Box, Dict
@@ -151,7 +151,7 @@ def environment_class(name: str) -> type[GymnasiumEnv]:
     return type("GymnasiumEnv", (GymnasiumEnv,), {"name": name, "id": gymnasium_id, "__doc__": GymnasiumEnv.__doc__})
 
 
-def is_gymnasium(env: Any) -> bool:
+def is_gymnasium(env: Any) -> TypeGuard[GymnasiumEnv]:
     """Whether an environment is one of Gymnasium's."""
     return isinstance(env, GymnasiumEnv)
 

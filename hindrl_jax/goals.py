@@ -91,8 +91,7 @@ def epsilon_filter(achieved_goals: Array, epsilon: Array, *, inclusive: bool = T
     return jnp.concatenate([jnp.ones(1, bool), keep_rest])
 
 
-@struct.dataclass(kw_only=True)
-class GoalTable:
+class GoalTable(struct.PyTreeNode, kw_only=True):
     """Goals to draw from: the first `count` rows, in the order in which the demonstrations reached them."""
 
     goals: Array  # (M, G) float32; rows from `count` on are padding

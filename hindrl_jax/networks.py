@@ -79,8 +79,7 @@ class MLP(nn.Module):
         return Dense(self.out_dim, self.bfloat16)(features)
 
 
-@struct.dataclass(kw_only=True)
-class ActionDistribution:
+class ActionDistribution(struct.PyTreeNode, kw_only=True):
     """A Gaussian squashed by tanh, one per batch column."""
 
     mean: Array  # (A, B), before tanh
@@ -125,14 +124,15 @@ def init_critics(key: Array, config: AgentConfig, *, input_dim: int, action_dim:
 
 def apply_actor(params: Params, inputs: Array, config: AgentConfig, *, action_dim: int) -> ActionDistribution:
     """The policy at inputs (input_dim, B); the logarithm of the deviation is clamped to [-20, 2]."""
-    mean, log_std = jnp.split(_actor(config, action_dim).apply(params, inputs), 2, axis=0)
+    output: Any = _actor(config, action_dim).apply(params, inputs)
+    mean, log_std = jnp.split(output, 2, axis=0)
     return ActionDistribution(mean=mean, log_std=jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX))
 
 
 def _apply_each(params: Params, inputs: Array, action: Array, config: AgentConfig, out_dim: int) -> Array:
     # One critic after the other: as one batched product they are slower on a CPU.
     joint = jnp.concatenate([inputs, action], axis=0)
-    critic = _critic(config, out_dim)
+    critic: Any = _critic(config, out_dim)
     num_critics = jax.tree.leaves(params)[0].shape[0]
     members = [jax.tree.map(lambda leaf, n=n: leaf[n], params) for n in range(num_critics)]
     return jnp.stack([critic.apply(member, joint) for member in members])

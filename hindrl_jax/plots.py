@@ -1,7 +1,8 @@
-"""Pictures of runs. Matplotlib is imported on first use and draws off screen."""
+"""Pictures of runs. Matplotlib is imported on first use and draws off screen, unless MPLBACKEND says where."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -160,7 +161,8 @@ def save_filter(achieved_goals: np.ndarray, kept: np.ndarray, epsilon: np.ndarra
 def _pyplot() -> Any:
     import matplotlib
 
-    matplotlib.use("Agg")
+    if "MPLBACKEND" not in os.environ:  # notebooks set it, and go on drawing after one of these pictures was made
+        matplotlib.use("Agg")
     from matplotlib import pyplot
 
     return pyplot

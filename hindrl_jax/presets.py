@@ -1,8 +1,8 @@
 """Configs by name: the four models of the thesis, under the project's own recipe, the thesis's settings, or the original code's.
 
-default    the project's own recipe, for a laptop CPU
-thesis     the hyperparameters of the thesis's appendix, on plain correct code
-original   the same, with the quirks of the original implementation that explain its published figures
+    default    the project's own recipe, for a laptop CPU
+    thesis     the hyperparameters of the thesis's appendix, on plain correct code
+    original   the same, with the quirks of the original implementation that explain its published figures
 
 Each has one column for the grid worlds and one for the reach tasks, as the thesis's appendix does. Environments of Gymnasium have the default only.
 """
@@ -57,7 +57,7 @@ def _as_algorithm(config: TrainConfig, algo: Algorithm) -> TrainConfig:
 
 def _default(algo: Algorithm, family: Family) -> TrainConfig:
     """The project's own recipe; for the grid that is what `TrainConfig()` says."""
-    encoding = "standardised" if family == "reach" else "multiscale"
+    encoding: Literal["standardised", "multiscale"] = "standardised" if family == "reach" else "multiscale"
     if algo == "bc":
         return TrainConfig(
             algo="bc",
@@ -95,7 +95,7 @@ def _default(algo: Algorithm, family: Family) -> TrainConfig:
 def _gymnasium(algo: Algorithm, env: Any) -> TrainConfig:
     """The recipe for environments of Gymnasium: rollouts aim at the goal that an episode comes with, as the demonstrations did."""
     tolerance = env.goal_tolerance
-    epsilon = dict(m=5) if tolerance is None else dict(epsilon=round(float(tolerance.min()), 4))
+    epsilon: dict[str, Any] = dict(m=5) if tolerance is None else dict(epsilon=round(float(tolerance.min()), 4))
     goal = GoalConfig(behavioural_goals="environment", **epsilon)
     if algo == "bc":
         config = _default("bc", "reach")
@@ -121,7 +121,7 @@ def _gymnasium(algo: Algorithm, env: Any) -> TrainConfig:
     )
 
 
-_FRAMEWORK = dict(input_encoding="raw", actor_average_rate=1.0, actor_average_span=0.0, policy_input="achieved_desired_observation")
+_FRAMEWORK: dict[str, Any] = dict(input_encoding="raw", actor_average_rate=1.0, actor_average_span=0.0, policy_input="achieved_desired_observation")
 """How the networks of the thesis's framework are fed and evaluated."""
 
 

@@ -22,8 +22,7 @@ from hindrl_jax.types import Array, Episodes
 _LEAST_ERROR = 1e-3  # added to every error, so that no transition is lost for ever; that of DQfD (Hester et al., 2018)
 
 
-@struct.dataclass(kw_only=True)
-class Priorities:
+class Priorities(struct.PyTreeNode, kw_only=True):
     """Priorities to the power of `priority_exponent`: positive for what can be drawn, 0 for padding and for what is being written."""
 
     demonstrations: Array  # (N, T)
@@ -31,8 +30,7 @@ class Priorities:
     largest: Array  # () the largest so far, bonuses left out; at least 1
 
 
-@struct.dataclass(kw_only=True)
-class Drawn:
+class Drawn(struct.PyTreeNode, kw_only=True):
     """Where the rows of a batch come from."""
 
     is_demonstration: Array  # (B,) bool

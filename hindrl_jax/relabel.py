@@ -1,12 +1,13 @@
 """Hindsight relabelling: which goal a transition is told, after the fact, to have been meant for.
 
 Sources of goals (Andrychowicz et al., HER, 2017; Davchev et al., HinDRL, 2021; thesis sections 2.3.3 and 4.1.2):
-  final               the last goal reached in the transition's own episode
-  future              a goal reached later in that episode; the thesis's "rollout-conditioned" (eq. 4.3)
-  episode             any goal reached in that episode
-  random              any goal reached in any episode of the replay
-  task_conditioned    any goal reached in the demonstrations (eq. 4.2)
-  joint_intersection  a goal reached later in that episode that lies within epsilon of a demonstrated one, or the demonstrated one itself
+
+    final               the last goal reached in the transition's own episode
+    future              a goal reached later in that episode; the thesis's "rollout-conditioned" (eq. 4.3)
+    episode             any goal reached in that episode
+    random              any goal reached in any episode of the replay
+    task_conditioned    any goal reached in the demonstrations (eq. 4.2)
+    joint_intersection  a goal reached later in that episode that lies within epsilon of a demonstrated one, or the demonstrated one itself
 
 The strategy joint_union takes task_conditioned with probability `union_sampling_ratio`, else future (eq. 4.4); mixture takes any sources with any
 weights. A row whose intersection is empty is not relabelled. What lies within epsilon of what is noted while an episode is lived

@@ -12,6 +12,7 @@ Transitions are drawn uniformly, by `sample_batch`, or by their priorities, by `
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,8 +28,7 @@ from hindrl_jax.relabel import choose_sources, hindsight_steps, intersection_ste
 from hindrl_jax.types import Array, Episodes, Transition, tree_where
 
 
-@struct.dataclass(kw_only=True)
-class ReplayState:
+class ReplayState(struct.PyTreeNode, kw_only=True):
     """Rings of episodes, one ring of R slots for each of the E environments; slot r of environment e is row e * R + r of `episodes`."""
 
     episodes: Episodes  # E * R episodes; what lies in a slot that is empty or being written is never sampled
@@ -355,7 +355,7 @@ def sample_batch(
     """
     key_demo, key_demo_step, key_episode, key_step, key_goal = jax.random.split(key, 5)
     size, num_demos = config.batch_size, demonstrations.lengths.shape[0]
-    read = dict(achieved_goal=achieved_goal, epsilon=epsilon, config=config)
+    read: dict[str, Any] = dict(achieved_goal=achieved_goal, epsilon=epsilon, config=config)
     rows = sample_episodes(key_episode, replay, size)
     steps = sample_steps(key_step, replay.episodes, rows)
     index = jnp.arange(size)
@@ -391,7 +391,7 @@ def sample_prioritised_batch(
       A batch of `config.batch_size` rows in no particular order, with weights, and where its rows come from.
     """
     key_draw, key_goal = jax.random.split(key)
-    read = dict(achieved_goal=achieved_goal, epsilon=epsilon, config=config)
+    read: dict[str, Any] = dict(achieved_goal=achieved_goal, epsilon=epsilon, config=config)
     drawn = prioritised.draw(key_draw, replay.priorities, config.batch_size)
     # How many rows come from where is not known when this is compiled, so each is read from both tables, and one reading thrown away.
     replayed = ~drawn.is_demonstration

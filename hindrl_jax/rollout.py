@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -11,14 +11,13 @@ from flax import struct
 
 from hindrl_jax.goals import GoalTable, sample_goals
 from hindrl_jax.randomness import uniform_in_groups
-from hindrl_jax.types import Array, Environment, TimeStep, action_to_env, tree_where
+from hindrl_jax.types import Array, Environment, RestorableEnvironment, TimeStep, action_to_env, tree_where
 
 Act = Callable[[Array, Array, Array], Array]
 """(key, observations (E, D), desired goals (E, G)) -> actions (E, A) in [-1, 1]."""
 
 
-@struct.dataclass(kw_only=True)
-class RolloutState:
+class RolloutState(struct.PyTreeNode, kw_only=True):
     """E environments in the middle of their episodes."""
 
     env_state: Any  # leaves (E, ...)
@@ -27,8 +26,7 @@ class RolloutState:
     judged_by_goal: Array  # (E,) bool, whether the episode is to be rewarded for reaching that goal rather than by the environment
 
 
-@struct.dataclass(kw_only=True)
-class StartTable:
+class StartTable(struct.PyTreeNode, kw_only=True):
     """Demonstrated states in which an episode may begin: all but the last of each demonstration, where nothing is left to do."""
 
     states: Array  # (N, T + 1, S) as vectors, see `RestorableEnvironment`; padded
@@ -76,12 +74,13 @@ def reset(
     key_env, key_goal = jax.random.split(key)
     env_state, observation = jax.vmap(env.reset)(jax.random.split(key_env, num_envs))
     if starts is not None:
+        restorable = cast(RestorableEnvironment, env)
         key_choice, key_start, key_states = jax.random.split(jax.random.fold_in(key, 2), 3)  # 2: split has used what 0 and 1 give
         vectors = sample_starts(key_start, starts, num_envs, share=demo_reset_share)
-        demonstrated = jax.vmap(env.vector_to_state)(jax.random.split(key_states, num_envs), vectors)
+        demonstrated = jax.vmap(restorable.vector_to_state)(jax.random.split(key_states, num_envs), vectors)
         chosen = jax.random.bernoulli(key_choice, demo_reset_ratio, (num_envs,))
         env_state = tree_where(chosen, demonstrated, env_state)
-        observation = jax.vmap(env.observe)(env_state)
+        observation = jax.vmap(restorable.observe)(env_state)
     return RolloutState(
         env_state=env_state,
         observation=observation,
@@ -107,8 +106,7 @@ def step(rollout: RolloutState, restarted: RolloutState, action: Array, env: Env
     return tree_where(time_step.terminated | time_step.truncated, restarted, continued), time_step
 
 
-@struct.dataclass(kw_only=True)
-class Evaluation:
+class Evaluation(struct.PyTreeNode, kw_only=True):
     """What became of a number of fresh episodes."""
 
     success: Array  # (episodes,) bool

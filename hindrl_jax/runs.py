@@ -1,11 +1,13 @@
 """A run's directory: what it was asked to do, how it went, and the policies that came of it.
 
-config.json       everything needed to run it again (`hindrl train --config`)
-metrics.csv       a row per evaluation and seed, written as the run goes
-summary.json      the outcome per seed and the totals
-parameters.npz    networks and behavioural goals, leading axis the seeds; no pickle
-curve.png, episode.gif
-checkpoint/       while it is under way, or if it was stopped: what it needs to go on
+    config.json       everything needed to run it again (`hindrl train --config`)
+    metrics.csv       a row per evaluation and seed, written as the run goes
+    summary.json      the outcome per seed and the totals
+    parameters.npz    networks and behavioural goals, leading axis the seeds; no pickle
+    curve.png, episode.gif
+    checkpoint/       while it is under way, or if it was stopped: what it needs to go on
+
+Each file is written whole or not at all, metrics.csv row by row.
 """
 
 from __future__ import annotations
@@ -43,8 +45,8 @@ from hindrl_jax.experiment import Result, Row
 from hindrl_jax.films import check_film, save_film, save_pictures
 from hindrl_jax.from_gymnasium import Simulators, is_gymnasium
 from hindrl_jax.goals import GoalTable, sample_goals
-from hindrl_jax.registry import checked, did_you_mean, make
-from hindrl_jax.types import RestorableEnvironment, action_to_env, compiler_options
+from hindrl_jax.registry import checked, did_you_mean, full_name, make, viewer
+from hindrl_jax.types import Episodes, RestorableEnvironment, action_to_env, compiler_options
 
 if TYPE_CHECKING:
     from hindrl_jax.reporters import Reporter
@@ -71,7 +73,7 @@ class RunSpec:
     def to_json(self) -> dict[str, Any]:
         """Plain data for `config.json`."""
         return {
-            "env": self.env.name,
+            "env": full_name(self.env),
             "env_args": dataclasses.asdict(self.env),
             "demos": self.demos,
             "seeds": list(self.seeds),
@@ -229,7 +231,7 @@ class RunWriter:
     def finish(self, result: Result, *, film: bool = True) -> dict[str, Any]:
         """Writes the parameters, the summary, the curve and (unless `film` is off) the film of an episode; returns the summary.
 
-        A film that cannot be drawn, for want of OpenGL, is a warning: the run is worth more.
+        A film that cannot be drawn, for want of OpenGL, is a warning: the run is worth more. A task without a viewer has no film.
         """
         self.report(result.rows)
         summary = summarise(result)
@@ -241,7 +243,9 @@ class RunWriter:
             reporter.finish(result.summaries())
         if film:
             try:
-                load_run(self.path).render(self.path / EPISODE)
+                run = load_run(self.path)
+                if is_gymnasium(run.spec.env) or viewer(run.spec.env) is not None:
+                    run.render(self.path / EPISODE)
             except UserError as error:
                 warnings.warn(f"no {EPISODE}: {error}", stacklevel=2)
         shutil.rmtree(self.path / CHECKPOINTS, ignore_errors=True)  # last, so that a process killed on the way here can be resumed
@@ -287,7 +291,7 @@ class SweepWriter:
         if there and not ((overwrite or resume) and SWEEP_SETTINGS in there):
             raise UserError(f"{path} already holds {', '.join(there)}: choose another --out, or replace a sweep with --overwrite")
         specs = [dataclasses.replace(spec, config=with_values(spec.config, setting)) for setting in settings]
-        choices = dict(overwrite=overwrite, resume=resume, reporters=reporters)
+        choices: dict[str, Any] = dict(overwrite=overwrite, resume=resume, reporters=reporters)
         self.runs = [RunWriter(path / _setting_folder(setting), spec, **choices) for setting, spec in zip(settings, specs, strict=True)]
 
     @property
@@ -335,9 +339,9 @@ class SweepWriter:
             table.append(setting | outcome)
         with disk_trouble(self.path):
             with (self.path / SWEEP).open("w", newline="") as file:
-                writer = csv.DictWriter(file, list(table[0]))
-                writer.writeheader()
-                writer.writerows(table)
+                rows = csv.DictWriter(file, list(table[0]))
+                rows.writeheader()
+                rows.writerows(table)
             plots.save_sweep(parts, [writer.path.name for writer in self.runs], self.path / SWEEP_CURVES)
         shutil.rmtree(self.path / CHECKPOINTS, ignore_errors=True)
         return table
@@ -480,13 +484,15 @@ class Run:
     def _play_in_gymnasium(self, keys: jax.Array, episodes: int, *, stochastic: bool) -> rollout.Evaluation:
         """Episodes of all seeds side by side, up to `num_envs` for each; leaves (S, episodes)."""
         num_seeds = len(self.spec.seeds)
-        policies = host.Policies(self.spec.env, self.spec.config, seed_mesh(num_seeds), stochastic=stochastic)
-        with contextlib.closing(Simulators(self.spec.env, num_seeds * min(self.spec.config.num_envs, episodes))) as simulators:
+        env: Any = self.spec.env
+        policies = host.Policies(env, self.spec.config, seed_mesh(num_seeds), stochastic=stochastic)
+        with contextlib.closing(Simulators(env, num_seeds * min(self.spec.config.num_envs, episodes))) as simulators:
             return host.evaluate(keys, simulators, policies, self.policies, self.scale, episodes)
 
     def _play_one_by_one(self, keys: jax.Array, episodes: int, *, stochastic: bool, report: Callable[[int], None]) -> rollout.Evaluation:
         """One episode after the other; leaves (S, episodes)."""
-        success, length = (np.zeros((len(keys), episodes), kind) for kind in (bool, np.int32))
+        success: Any = np.zeros((len(keys), episodes), bool)
+        length: Any = np.zeros((len(keys), episodes), np.int32)
         for i, key in enumerate(keys):
             play_episode = player(self.spec.env, self._act(i, stochastic=stochastic, any_goal=True), 1)
             for n, key_episode in enumerate(jax.random.split(key, episodes)):
@@ -523,10 +529,7 @@ class Run:
         env = self.spec.env
         keys = jnp.atleast_1d(jax.random.key(0) if key is None else key)
         check_film(path, len(keys))
-        seed = self.spec.seeds[0] if seed is None else seed
-        if seed not in self.spec.seeds:
-            raise UserError(f"{self.path} has no seed {seed}: choose one of {', '.join(map(str, self.spec.seeds))}")
-        index = self.spec.seeds.index(seed)
+        index = self._index_of(seed)
         if is_gymnasium(env):
             return self._film(path, index, keys, stochastic=stochastic)
         play_episode = player(env, self._act(index, stochastic=stochastic, any_goal=False), 1)
@@ -536,7 +539,7 @@ class Run:
 
     def _film(self, path: Path, index: int, keys: jax.Array, *, stochastic: bool) -> int:
         """`render` of an environment of Gymnasium, which draws itself."""
-        env = self.spec.env
+        env: Any = self.spec.env
         actor, scale = jax.tree.map(lambda leaf: leaf[index : index + 1], (self.policies, self.scale))
         policies = host.Policies(env, self.spec.config, seed_mesh(1), stochastic=stochastic)
         pictures, num_solved = [], 0
@@ -549,12 +552,39 @@ class Run:
             save_pictures(pictures, [1.0 / env.description.render_fps] * len(pictures), path)
         return num_solved
 
+    def play(self, episodes: int = 1, *, seed: int | None = None, key: jax.Array | None = None, stochastic: bool = False) -> Episodes:
+        """Plays fresh episodes with one seed's policy (the first seed's by default), to be looked at step by step; solved or not.
+
+        The policy aims at the first behavioural goal, the end of the first demonstration.
+
+        Args:
+          episodes: N, how many.
+          seed: one of the run's seeds.
+          key: which.
+          stochastic: sample the actions.
+
+        Returns:
+          A table of N episodes with their states, repeated after the end.
+
+        Raises:
+          UserError: if the run has no such seed.
+        """
+        act = self._act(self._index_of(seed), stochastic=stochastic, any_goal=False)
+        return player(self.spec.env, act, episodes)(jax.random.key(0) if key is None else key)
+
+    def _index_of(self, seed: int | None) -> int:
+        """Where a seed, the first one by default, stands among those of the run."""
+        seed = self.spec.seeds[0] if seed is None else seed
+        if seed not in self.spec.seeds:
+            raise UserError(f"{self.path} has no seed {seed}: choose one of {', '.join(map(str, self.spec.seeds))}")
+        return self.spec.seeds.index(seed)
+
 
 def draw_episodes(path: Path, env: RestorableEnvironment, episodes: Sequence[np.ndarray]) -> None:
     """Draws episodes from their states (length + 1, S each): a film of them, one after the other, or as a PNG the last state.
 
     Raises:
-      UserError: for another kind of file, a place that cannot be written, or states of another environment.
+      UserError: for another kind of file, a place that cannot be written, states of another environment, or one that nothing draws.
     """
     check_film(path, len(episodes))
     if is_gymnasium(env):
@@ -618,7 +648,8 @@ def _save_parameters(path: Path, result: Result) -> None:
         "input_scale": {field.name: getattr(scale, field.name) for field in dataclasses.fields(scale)},
     }
     temporary = path.with_suffix(".partial.npz")
-    np.savez(temporary, **{name: np.asarray(leaf) for name, leaf in flatten_dict(tree, sep="/").items()})
+    arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in flatten_dict(tree, sep="/").items()}
+    np.savez(temporary, **arrays)
     os.replace(temporary, path)
 
 

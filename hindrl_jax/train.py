@@ -6,7 +6,6 @@ over its gradient steps.
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import jax
@@ -27,8 +26,7 @@ from hindrl_jax.rollout import Act, Evaluation, RolloutState, StartTable
 from hindrl_jax.types import Array, Environment, Episodes, TimeStep, Transition, action_to_env, tree_where
 
 
-@struct.dataclass(kw_only=True)
-class Guidance:
+class Guidance(struct.PyTreeNode, kw_only=True):
     """What training takes from the demonstrations; constant during a run."""
 
     demonstrations: Episodes  # N episodes
@@ -39,8 +37,7 @@ class Guidance:
     starts: StartTable | None  # demonstrated states in which training episodes may begin; None if none do
 
 
-@struct.dataclass(kw_only=True)
-class TrainState:
+class TrainState(struct.PyTreeNode, kw_only=True):
     """All that a run needs to go on."""
 
     agent: AgentState
@@ -150,7 +147,7 @@ def _uses_intersections(config: TrainConfig) -> bool:
 
 def _new_episodes(key: Array, data: Guidance, env: Environment, config: TrainConfig, progress: Array | float) -> RolloutState:
     share = jnp.minimum(progress / config.demo_reset_curriculum, 1.0) if config.demo_reset_curriculum > 0.0 else 1.0
-    starts = dict(starts=data.starts, demo_reset_ratio=config.demo_reset_ratio, demo_reset_share=share)
+    starts: dict[str, Any] = dict(starts=data.starts, demo_reset_ratio=config.demo_reset_ratio, demo_reset_share=share)
     return rollout.reset(key, env, data.behavioural_goals, config.num_envs, **starts)
 
 
@@ -311,7 +308,7 @@ def improve(
     key_batch: Array, key_updates: Array, state: TrainState, data: Guidance, env: Environment, config: TrainConfig
 ) -> tuple[TrainState, Metrics]:
     """`updates_per_iteration` gradient steps on batches drawn from the replay and the demonstrations, and their mean metrics."""
-    given = dict(
+    given: dict[str, Any] = dict(
         replay=state.replay,
         demonstrations=data.demonstrations,
         table=data.goals,
@@ -321,12 +318,13 @@ def improve(
     )
     if config.batch.has_priorities:
         key_batch, key_errors = jax.random.split(key_batch)
-        draw = functools.partial(replay.sample_prioritised_batch, **given)
-        batches, drawn = jax.vmap(draw)(jax.random.split(key_batch, config.updates_per_iteration))
+        keys = jax.random.split(key_batch, config.updates_per_iteration)
+        batches, drawn = jax.vmap(lambda key: replay.sample_prioritised_batch(key, **given))(keys)
         state, metrics = _gradient_steps(key_updates, state, batches, data, env, config)
         return _with_new_priorities(key_errors, state, batches, drawn, data, env, config), metrics
-    draw = functools.partial(replay.sample_batch, demo_rows=replay.num_demo_rows(state.env_steps, config.batch), **given)
-    batches = jax.vmap(draw)(jax.random.split(key_batch, config.updates_per_iteration))
+    demo_rows = replay.num_demo_rows(state.env_steps, config.batch)
+    keys = jax.random.split(key_batch, config.updates_per_iteration)
+    batches = jax.vmap(lambda key: replay.sample_batch(key, demo_rows=demo_rows, **given))(keys)
     return _gradient_steps(key_updates, state, batches, data, env, config)
 
 
@@ -369,7 +367,7 @@ def _demonstration_batch(key: Array, data: Guidance, env: Environment, config: T
     key_demo, key_step = jax.random.split(key)
     rows = uniform_index(key_demo, (config.batch.batch_size,), data.demonstrations.lengths.shape[0])
     steps = replay.sample_steps(key_step, data.demonstrations, rows)
-    read = dict(achieved_goal=env.achieved_goal, epsilon=data.epsilon, config=config.batch)
+    read: dict[str, Any] = dict(achieved_goal=env.achieved_goal, epsilon=data.epsilon, config=config.batch)
     return replay.demonstration_rows(data.demonstrations, rows, steps, **read)
 
 

@@ -5,7 +5,7 @@ Shape letters, project-wide: B batch, T time (the horizon), N critics, Q quantil
 
 from __future__ import annotations
 
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +14,7 @@ from flax import struct
 Array = jax.Array
 
 
-@struct.dataclass(kw_only=True)
-class TimeStep:
+class TimeStep(struct.PyTreeNode, kw_only=True):
     """What one environment step returns.
 
     `observation` is always the true next observation, also when the episode has just ended: resetting is the caller's business.
@@ -27,8 +26,7 @@ class TimeStep:
     truncated: Array  # () bool, the horizon cut the episode; the future value still exists
 
 
-@struct.dataclass(kw_only=True)
-class Episodes:
+class Episodes(struct.PyTreeNode, kw_only=True):
     """A table of episodes, padded to the horizon. Used for demonstrations and, through `replay`, for rollouts.
 
     Row t of an episode is the transition (observations[t], actions[t], rewards[t], observations[t + 1]) for 0 <= t < length. Entries past the
@@ -44,8 +42,7 @@ class Episodes:
     states: Array | None = None  # (N, T + 1, S) environment states as vectors; None where they are not kept
 
 
-@struct.dataclass(kw_only=True)
-class Transition:
+class Transition(struct.PyTreeNode, kw_only=True):
     """A batch of (n-step) transitions, ready for the losses."""
 
     observation: Array  # (B, D)
@@ -67,8 +64,16 @@ class Environment(Protocol):
     `reset` and `step` are unbatched; the caller applies `jax.vmap`. The state is any pytree and carries its own random key.
     """
 
-    name: str
-    horizon: int  # number of steps after which an episode is truncated
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    def __hash__(self) -> int: ...
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def horizon(self) -> int:
+        """Number of steps after which an episode is truncated."""
 
     @property
     def observation_dim(self) -> int: ...

@@ -31,8 +31,7 @@ from hindrl_jax.types import Array, TimeStep
 Box = tuple[tuple[int, int], tuple[int, int]]  # lowest and highest (x, y), both inside the box
 
 
-@struct.dataclass(kw_only=True)
-class GridState:
+class GridState(struct.PyTreeNode, kw_only=True):
     """Everything that the next step depends on."""
 
     key: Array  # () typed random key, constant within an episode
@@ -285,7 +284,7 @@ class FixedGridPickAndPlace(_PickAndPlace):
         return tuple(((x, y), (x + extent, y + extent)) for x, y in corners[: self.num_objects + 2])
 
     def _start_cells(self, bits: Array) -> Array:
-        lowest = np.array([box[0] for box in self.start_boxes], np.int32)
+        lowest = jnp.array([box[0] for box in self.start_boxes], jnp.int32)
         ranks = (bits % np.uint32(self.random_box_size**2)).astype(jnp.int32)
         return lowest + jax.vmap(_rank_to_cell, (0, None))(ranks, self.random_box_size)
 

@@ -48,8 +48,8 @@ def frame(env: GridPickAndPlace | FixedGridPickAndPlace, state: GridState, *, ca
     cell = max(_MIN_CELL, -(-_MIN_WIDTH // env.size))
     width = env.size * cell + 2 * _MARGIN
     canvas = _Canvas(width, width - _MARGIN // 2, cell)  # the caption takes the other half of the margin
-    agent, goal, objects = (tuple(int(v) for v in np.ravel(a)) for a in (state.agent, state.goal, state.objects))
-    objects = [objects[2 * i : 2 * i + 2] for i in range(env.num_objects)]
+    agent, goal, cells = (tuple(int(v) for v in np.ravel(a)) for a in (state.agent, state.goal, state.objects))
+    objects = [cells[2 * i : 2 * i + 2] for i in range(env.num_objects)]
     held, num_delivered = int(state.held), int(state.num_delivered)
 
     canvas.rectangle((0, 0), (env.size - 1, env.size - 1), _CELL)

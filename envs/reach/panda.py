@@ -360,14 +360,14 @@ def inverse(matrix: Array) -> Array:
     return jax.lax.fori_loop(0, size, eliminate, matrix)
 
 
-def _product(a: Array, b: Array) -> Array:
+def _product(a: Array, b: Array | np.ndarray) -> Array:
     """a b of small matrices (m, k) and (k, n): a sum of outer products, because a batch of tiny `dot`s is slow on a CPU."""
-    return sum(a[:, i, None] * b[None, i, :] for i in range(a.shape[1]))
+    return functools.reduce(jnp.add, [a[:, i, None] * b[None, i, :] for i in range(a.shape[1])])
 
 
 def _times(a: Array, x: Array) -> Array:
     """a x of a small matrix (m, k) and a vector (k,)."""
-    return sum(a[:, i] * x[i] for i in range(a.shape[1]))
+    return functools.reduce(jnp.add, [a[:, i] * x[i] for i in range(a.shape[1])])
 
 
 def shortened_command(command: Array) -> Array:

@@ -40,8 +40,7 @@ _DOWN = np.diag([1.0, -1.0, -1.0]).astype(np.float32)
 _ACTION_BOUND = np.array(3 * [panda.MAX_TRANSLATION] + 3 * [panda.MAX_ROTATION], np.float32)
 
 
-@struct.dataclass(kw_only=True)
-class ReachState:
+class ReachState(struct.PyTreeNode, kw_only=True):
     """Everything that the next step depends on. K waypoints."""
 
     key: Array  # () typed random key, constant within an episode
@@ -129,6 +128,10 @@ class _Reach(abc.ABC):
     def observation_high(self) -> np.ndarray:
         """(D,) float32, the greatest."""
         return self._observation_bounds()[1]
+
+    @property
+    @abc.abstractmethod
+    def goal_dim(self) -> int: ...
 
     @property
     def goal_tolerance(self) -> np.ndarray | None:

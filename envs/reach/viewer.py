@@ -150,8 +150,8 @@ def _draw(env: FixedParameterizedReach | ParameterizedReach, state: ReachState, 
         top = positions[i] - _HAND_TO_FINGERTIPS * rotations[i][:, 2]
         x, y = stage.pixel(top + np.array([0.0, 0.0, 0.04]))
         label = _label(i + 1, i - num_reached)
-        corner = [round(float(np.clip(v - label.width / 2, 0, limit - label.width))) for v, limit in ((x, _WIDTH), (y, _HEIGHT))]
-        image.paste(label, corner, label)
+        left, upper = (round(float(np.clip(v - label.width / 2, 0, limit - label.width))) for v, limit in ((x, _WIDTH), (y, _HEIGHT)))
+        image.paste(label, (left, upper), label)
 
     progress = f"step {int(state.step)}    reached {num_reached}/{num_waypoints}"
     strip = drawing.caption_strip(_WIDTH, caption or env.name, progress, solved=bool(env.is_solved(state)))
@@ -184,11 +184,11 @@ def _label(number: int, turns_left: int) -> Image.Image:
     scale = drawing.SUPERSAMPLING
     size, rim = 2 * radius * scale, rim * scale
     colour, strength = (_GREY, 1.0) if turns_left < 0 else (_GREEN, _opacity(turns_left))
-    colour = tuple(round(255 * (1 - strength * (1 - c))) for c in colour)
+    mixed = tuple(round(255 * (1 - strength * (1 - c))) for c in colour)
     image = Image.new("RGBA", (size, size))
     draw = ImageDraw.Draw(image)
     draw.ellipse([0, 0, size - 1, size - 1], fill=drawing.BACKGROUND)
-    draw.ellipse([rim, rim, size - 1 - rim, size - 1 - rim], fill=colour)
+    draw.ellipse([rim, rim, size - 1 - rim, size - 1 - rim], fill=mixed)
     if turns_left < 0:
         drawing.tick(draw, size / 2, size / 2, size / 2 - rim)
     else:

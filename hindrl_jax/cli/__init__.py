@@ -63,7 +63,7 @@ def _set_up_jax() -> None:
     JAX_ENABLE_COMPILATION_CACHE=false turns it off. Each core counts as a device, so that several seeds are spread over the cores:
     a core is busier with a seed of its own than with its share of every operation. JAX_NUM_CPU_DEVICES=1 turns that off.
     """
-    if jax.config.jax_compilation_cache_dir is None:
+    if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]  # defined while jax starts
         folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hindrl_jax"
         jax.config.update("jax_compilation_cache_dir", str(folder))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
@@ -59,7 +60,7 @@ def compare(arguments: list[str]) -> None:
         write_csv(compared, options.csv)
         console.print(f"wrote {options.csv}")
     if options.to is not None:
-        over = "updates" if options.over == "steps" and all(run.cloning for run in runs) else options.over
+        over: Any = "updates" if options.over == "steps" and all(run.cloning for run in runs) else options.over
         with disk_trouble(options.to):
             plots.save_comparison(runs, options.to, over=over)
         console.print(f"wrote {options.to}")

@@ -62,7 +62,7 @@ def record(arguments: list[str]) -> None:
     name = peek(arguments, "env") or "FixedGridPickAndPlace"
     entry = task(name)
     if entry.expert is None:
-        raise UserError(f"no expert is known for {name}: record a policy of your own with hindrl_jax.record_gymnasium, from Python")
+        raise UserError(f"no expert is known for {name}: give one to hindrl_jax.register, or record a policy with hindrl_jax.record_gymnasium")
     namespace = dataclasses.make_dataclass(
         "Record",
         [
@@ -98,7 +98,7 @@ def record(arguments: list[str]) -> None:
     console.print(f"wrote {options.out}: {counted(len(lengths), 'demonstration')} of {env.name}, mean length {lengths.mean():.1f} steps")
 
 
-def _record_by_hand(env: RestorableEnvironment, options: Record) -> tuple[RestorableEnvironment, Episodes]:
+def _record_by_hand(env: Any, options: Record) -> tuple[RestorableEnvironment, Episodes]:
     """The environment in robosuite, and what a person did there."""
     if not hasattr(env, "backend"):
         raise UserError(f"--device {options.device} steers a robot's arm, and {env.name} has none: choose a reach environment, or drop --device")
@@ -160,7 +160,9 @@ def _print_recording(options: Info, recording: Recording) -> None:
     summary = summarise_recording(options.source, recording)
     achieved, lengths, epsilon = _goals(recording, m=options.m, k=options.k)
     filtered = goal_table(achieved, lengths, epsilon, filtered=True)
-    arguments = ", ".join(f"{name}={value}" for name, value in summary.env_kwargs.items()) if summary.env_name in TASKS else "..."
+    own = ":" in summary.env_name and not summary.env_name.startswith("gymnasium:")  # "module:Name", a task of the user's own
+    ours = own or summary.env_name in TASKS
+    arguments = ", ".join(f"{name}={value}" for name, value in summary.env_kwargs.items()) if ours else "..."
     console.print(f"{options.source}: {summary.env_name}({arguments})")
     console.print(
         f"{counted(summary.num_demonstrations, 'demonstration')}, {summary.num_solved} solved, {summary.num_transitions} transitions, "

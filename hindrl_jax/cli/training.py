@@ -231,7 +231,7 @@ def _fit(spec: RunSpec, configs: Sequence[TrainConfig], writer: RunWriter | Swee
     num_seeds = len(spec.seeds)
     seeds = f"seed {spec.seeds[0]}" if num_seeds == 1 else f"{num_seeds} seeds from {spec.seeds[0]}"
     settings = f", {len(configs)} settings" if len(configs) > 1 else ""
-    runs = dict(seeds=spec.seeds * len(configs), config=[config for config in configs for _ in spec.seeds])
+    runs: dict[str, Any] = dict(seeds=spec.seeds * len(configs), config=[config for config in configs for _ in spec.seeds])
     if writer is None:
         return fit(spec.env, demonstrations * len(configs), **runs)
     console.print(f"{spec.env.name}, {spec.config.algo}, {counted(demonstrations[0].lengths.shape[0], 'demonstration')}, {seeds}{settings}")
@@ -265,7 +265,7 @@ def _fit(spec: RunSpec, configs: Sequence[TrainConfig], writer: RunWriter | Swee
                 progress.close()
                 _stop(result, stop_signals.received, writer, checkpoints)
 
-        restore = {} if checkpoints is None else {"restore": checkpoints.restore}
+        restore: dict[str, Any] = {} if checkpoints is None else {"restore": checkpoints.restore}
         try:
             return fit(spec.env, demonstrations * len(configs), **runs, report=report, **restore)
         except Diverged as error:
@@ -327,7 +327,7 @@ def _speed_line(summary: dict[str, Any]) -> str:
 
 def parse_train(arguments: list[str], options_class: type[TrainOptions] = TrainOptions, program: str = "hindrl train") -> tuple[RunSpec, Any]:
     """Environment, algorithm and preset decide which flags there are and their defaults, so they are read first."""
-    chosen = {name: peek(arguments, name) for name in ("env", "algo", "preset", "config")}
+    chosen: dict[str, Any] = {name: peek(arguments, name) for name in ("env", "algo", "preset", "config")}
     if chosen["config"] is not None:
         for name in ("env", "algo", "preset"):
             if chosen[name] is not None:
@@ -337,11 +337,13 @@ def parse_train(arguments: list[str], options_class: type[TrainOptions] = TrainO
         name = chosen["env"] or "FixedGridPickAndPlace"
         config = preset(chosen["algo"] or "hindrl", chosen["preset"] or "default", env=name)
         env_arguments = ORIGINAL_RULES[task(name).family] if chosen["preset"] == "original" else {}
+        known = {field.name for field in dataclasses.fields(task(name).environment)}
+        env_arguments = {field: value for field, value in env_arguments.items() if field in known}  # a task of one's own need not have such rules
         spec = RunSpec(env=make(name, **env_arguments), config=config, demos="1", seeds=(0,))
 
     environment_class = type(spec.env)
-    fields = [
-        ("env", env_names(spec.env.name), spec.env.name, ENV_HELP),
+    fields: list[tuple[str, Any, Any, str]] = [
+        ("env", env_names(chosen["env"] or spec.env.name), spec.env.name, ENV_HELP),
         ("preset", Preset, chosen["preset"] or "default", "Where the other defaults come from: our recipe, the thesis, or its original code."),
         ("config", Path | None, None, "Run again what a config.json (or the directory of a run) says; other flags change it."),
         ("resume", Path | None, None, "Go on with the run, or sweep, of a directory that was stopped or killed, as if it had never been."),

@@ -163,7 +163,7 @@ def _leaves(tree: Any, root: str) -> dict[str, Any]:
     """The arrays of nested dictionaries, by their path; `root` names a single array."""
     if not isinstance(tree, dict):
         return {root: tree}
-    found = {}
+    found: dict[str, Any] = {}
     for key, value in tree.items():
         found |= {f"{key}/{below}" if below else key: leaf for below, leaf in _leaves(value, "").items()}
     return found
@@ -308,7 +308,7 @@ def _spaces(recording: Recording) -> dict[str, Any]:
 
     first = recording.demonstrations[0]
     arrays = zip(OBSERVATION_KEYS, (first.observations, first.achieved_goals, first.desired_goal), strict=True)
-    goals = {
+    goals: dict[str, spaces.Space[Any]] = {
         key: spaces.Box(-np.inf, np.inf, (array.shape[-1],), array.dtype.type if array.dtype.kind == "f" else np.float32) for key, array in arrays
     }
     return {"observation_space": spaces.Dict(goals), "action_space": spaces.Box(-1.0, 1.0, first.actions.shape[1:], np.float32)}

@@ -59,7 +59,8 @@ def content(recording: Recording) -> bytes:
     arrays |= {f"extra/{name}": array for name, array in recording.extras.items()}
     arrays |= {f"extra/data/{demo.name}/{name}": array for demo in demos for name, array in demo.extras.items()}
     archive = io.BytesIO()
-    np.savez_compressed(archive, **arrays)
+    written: dict[str, Any] = arrays
+    np.savez_compressed(archive, **written)
     return archive.getvalue()
 
 
