@@ -6,7 +6,7 @@ PEERS_PIP = benchmarks/$(PIP) -r benchmarks/requirements-peers.txt
 INTEROP_PIP = tests/interop/$(PIP)
 TORCH = torch torchvision
 
-.PHONY: train test test-slow test-interop lint bench clean
+.PHONY: train test test-slow test-interop coverage lint docs package bench clean
 
 train: .venv/.installed  ## one demonstration, one seed, about a minute
 	.venv/bin/hindrl train --env FixedGridPickAndPlace --algo hindrl --demos 1 --seed 2 --out runs/quickstart --overwrite
@@ -20,15 +20,29 @@ test-slow: .venv/.installed-test  ## the learning tests, which take minutes each
 test-interop: tests/interop/.venv/.installed  ## robomimic's own tools on our files, and ours on its files
 	tests/interop/.venv/bin/python -m pytest tests/interop
 
+coverage: .venv/.installed-test  ## which lines the fast tests run; build/coverage/index.html shows them
+	.venv/bin/python -m pytest --numprocesses auto --maxprocesses 2 --dist loadfile --cov --cov-report term:skip-covered --cov-report html
+
 lint: .venv/.installed-test
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
+	.venv/bin/mypy
+
+docs: .venv/.installed-test  ## site/index.html; a warning is an error
+	.venv/bin/python docs/generate.py
+	NO_MKDOCS_2_WARNING=1 .venv/bin/python -m mkdocs build --strict --quiet
+
+package: .venv/.installed-test  ## wheel and sdist in dist/, each tried in an environment of its own
+	rm -rf build/lib dist
+	.venv/bin/python -m build
+	tests/try_package.sh $(PYTHON) dist/*.whl
+	tests/try_package.sh $(PYTHON) dist/*.tar.gz
 
 bench: .venv/.installed benchmarks/.venv/.installed  ## writes benchmarks/RESULTS.md, about 20 minutes; e.g. make bench BENCH="--only seeds startup"
 	.venv/bin/python -m benchmarks.run $(BENCH)
 
 clean:  ## everything that can be made again; results in runs/ stay
-	rm -rf .venv benchmarks/.venv tests/interop/.venv build dist .pytest_cache .hypothesis .ruff_cache *.egg-info
+	rm -rf .venv benchmarks/.venv tests/interop/.venv build dist site docs/generated .coverage .mypy_cache .pytest_cache .hypothesis .ruff_cache *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The stamp files say which lock was installed last, so that a second call installs nothing.

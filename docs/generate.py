@@ -1,0 +1,97 @@
+"""Writes docs/generated/: the pages that come from elsewhere in the project, so that they cannot go stale. `make docs` runs it first.
+
+The command line's page is what each command answers to --help; notebooks become pages without their outputs, since none are stored.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import re
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+OUT = ROOT / "docs" / "generated"
+WIDTH = 110  # characters, of the help texts
+
+# Files shown as pages, with the links in them that lead elsewhere in the site. A link to a file that is no page is shown without its link.
+PAGES = {
+    "benchmark-results.md": ("benchmarks/RESULTS.md", {"README.md": "benchmark-method.md"}),
+    "benchmark-method.md": ("benchmarks/README.md", {"RESULTS.md": "benchmark-results.md"}),
+    "changelog.md": ("CHANGELOG.md", {}),
+    "contributing.md": ("CONTRIBUTING.md", {}),
+}
+
+
+def main() -> None:
+    """Writes all of them, and removes what is no longer made."""
+    OUT.mkdir(exist_ok=True)
+    pages = {name: page(ROOT / source, links) for name, (source, links) in PAGES.items()}
+    pages |= {path.with_suffix(".md").name: notebook(path) for path in sorted((ROOT / "notebooks").glob("*.ipynb"))}
+    pages["command-line.md"] = command_line()
+    for path in OUT.iterdir():
+        if path.name not in pages:
+            path.unlink()
+    for name, text in pages.items():
+        (OUT / name).write_text(text)
+
+
+def page(source: Path, links: dict[str, str]) -> str:
+    """A Markdown file of the project, with its links made to fit."""
+
+    def link(found: re.Match[str]) -> str:
+        text, target = found.groups()
+        if "://" in target or target.startswith("#"):
+            return found[0]
+        return f"[{text}]({links[target]})" if target in links else f"{text} (`{(source.parent / target).resolve().relative_to(ROOT)}`)"
+
+    return re.sub(r"\[([^\]]*)\]\(([^)]*)\)", link, source.read_text())
+
+
+def notebook(path: Path) -> str:
+    """A notebook as Markdown: its text, and its code in fences."""
+    cells = []
+    for cell in json.loads(path.read_text())["cells"]:
+        text = "".join(cell["source"])
+        cells.append(f"```python\n{text}\n```" if cell["cell_type"] == "code" else text)
+    title, *rest = cells
+    where = f'!!! note ""\n    This is `notebooks/{path.name}`, without its pictures: run it to see them, '
+    where += "with `.venv/bin/pip install notebook` and `.venv/bin/jupyter notebook notebooks` after `make train`."
+    # Links between notebooks are links between their pages here.
+    return re.sub(r"\((\d\d_\w+)\.ipynb\)", r"(\1.md)", "\n\n".join([title, where, *rest]) + "\n")
+
+
+def command_line() -> str:
+    """Every command's answer to --help."""
+    os.environ["COLUMNS"] = str(WIDTH)  # read by argparse's and rich's formatters
+    from hindrl_jax.cli import COMMANDS
+
+    sections = ["# Command line", "What each command answers to `--help`. Flags of the environment and of the config follow from its `--env`."]
+    for name, command in COMMANDS.items():
+        for words, function in [((name,), command)] if callable(command) else [((name, sub), f) for sub, f in command.items()]:
+            sections += [f"## hindrl {' '.join(words)}", str(function.__doc__), f"```text\n{help_text(words)}\n```"]
+            if words in (("train",), ("demos", "record")):
+                arm = help_text((*words, "--env", "FixedParameterizedReach"))
+                sections += [f"### hindrl {' '.join(words)}, for the arm", "With `--env FixedParameterizedReach`:", f"```text\n{arm}\n```"]
+    return "\n\n".join(sections) + "\n"
+
+
+def help_text(words: tuple[str, ...]) -> str:
+    """What `hindrl WORDS --help` prints, as plain text."""
+    from hindrl_jax import cli
+
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
+        cli.main([*words, "--help"])
+    text = re.sub(r"\x1b\[[0-9;]*m", "", printed.getvalue()).rstrip()
+    if not text.startswith("usage: hindrl"):
+        raise RuntimeError(f"hindrl {' '.join(words)} --help printed no help: {text[:200]!r}")
+    return "\n".join(line.rstrip() for line in text.splitlines())
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(ROOT))
+    main()
