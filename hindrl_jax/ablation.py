@@ -259,7 +259,7 @@ def settings_of(out: Path, *, tasks: Iterable[str], levers: Iterable[Lever], see
       tasks: keys of `ABLATION_TASKS`.
       levers: which of `LEVERS`.
       seeds: the same for all settings.
-      steps: environment steps of each run; None leaves it to the recipe.
+      steps: environment steps of each run; None takes those of the recipe until the agent begins anew.
 
     Raises:
       UserError: if a config is refused.
@@ -267,12 +267,19 @@ def settings_of(out: Path, *, tasks: Iterable[str], levers: Iterable[Lever], see
     settings = []
     for task, lever in itertools.product(tasks, (BASELINE, *levers)):
         chosen = ABLATION_TASKS[task]
-        config = preset("hindrl", env=chosen.env)
+        config = _first_life(preset("hindrl", env=chosen.env))
         if steps is not None:
             config = checked(functools.partial(dataclasses.replace, config, steps=steps))
         spec = RunSpec(env=make(chosen.env, **dict(chosen.env_args)), config=apply(config, lever), demos=str(chosen.num_demos), seeds=seeds)
         settings.append(Setting(task=task, lever=lever, path=out / task / lever.name, spec=spec))
     return settings
+
+
+def _first_life(config: TrainConfig) -> TrainConfig:
+    """The recipe until its agent begins anew: what a change does shows there, and a second life would hide it."""
+    if not config.agent_resets:
+        return config
+    return dataclasses.replace(config, steps=round(config.steps * config.agent_resets[0]), agent_resets=())
 
 
 def is_finished(setting: Setting) -> bool:
@@ -465,9 +472,10 @@ def _csv_row(outcome: Outcome) -> dict[str, Any]:
 
 _EXPLANATION = """# Ablation
 
-The default recipe with one change at a time, {seeds} seeds from {first}, {steps:,} environment steps each. Every change is trained with the same
-seeds, which have the same demonstrations. In brackets: 95% bootstrap intervals over the seeds, somewhat too narrow with 16 seeds and much too
-narrow with fewer than 8 or so. They describe single comparisons: of changes without any effect, one in twenty or more shows a difference by chance.
+The default recipe, until its agent would begin anew, with one change at a time, {seeds} seeds from {first}, {steps:,} environment steps each. Every
+change is trained with the same seeds, which have the same demonstrations. In brackets: 95% bootstrap intervals over the seeds, somewhat too narrow
+with 16 seeds and much too narrow with fewer than 8 or so. They describe single comparisons: of changes without any effect, one in twenty or more
+shows a difference by chance.
 
 - **95%**: seeds of which an evaluation along the run reached 95% success.
 - **steps to 95%**: environment steps to the first such evaluation, median over all seeds; > is said where the run ended before.

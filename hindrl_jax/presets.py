@@ -56,7 +56,7 @@ def _as_algorithm(config: TrainConfig, algo: Algorithm) -> TrainConfig:
 
 
 def _default(algo: Algorithm, family: Family) -> TrainConfig:
-    """The project's own recipe; for the grid that is what `TrainConfig()` says."""
+    """The project's own recipe; for the grid `TrainConfig()` for longer, and with a second life."""
     encoding: Literal["standardised", "multiscale"] = "standardised" if family == "reach" else "multiscale"
     if algo == "bc":
         return TrainConfig(
@@ -67,7 +67,7 @@ def _default(algo: Algorithm, family: Family) -> TrainConfig:
             agent=AgentConfig(net_arch=(64, 64), actor_average_span=0.0, input_encoding=encoding),
         )
     if family == "grid":
-        return TrainConfig()
+        return TrainConfig(steps=240_000, agent_resets=(1 / 3,))
     return TrainConfig(
         steps=44_000,
         num_envs=16,

@@ -218,6 +218,12 @@ def test_outcomes_by_hand(by_hand):
     assert (better.seeds_reaching_95, better.relative_cost, better.verdict()) == (2, 0.5, "better")
 
 
+def test_levers_are_compared_within_the_first_life_of_the_agent(tmp_path):
+    (setting,) = settings_of(tmp_path, tasks=["fixed-1"], levers=[], seeds=(0, 1))
+    recipe = preset("hindrl", env="FixedGridPickAndPlace")
+    assert setting.spec.config == dataclasses.replace(recipe, steps=80_000, agent_resets=())
+
+
 def test_without_its_baseline_a_task_has_no_outcomes(by_hand):
     (by_hand[0].path / "summary.json").unlink()
     assert outcomes_of(by_hand) == []

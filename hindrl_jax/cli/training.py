@@ -245,6 +245,8 @@ def _fit(spec: RunSpec, configs: Sequence[TrainConfig], writer: RunWriter | Swee
             if checkpoints is not None:
                 checkpoints.save_demonstrations(demonstrations)
             progress.say(f"compiled in {result.compile_seconds:.1f} s{_on_devices(result)}")
+            for share in spec.config.agent_resets:
+                progress.say(f"the agent begins anew at step {share * spec.config.steps:,.0f}, so success will drop there and come back")
             if resumes:
                 progress.say(f"going on at step {result.steps_done:,}" if result.steps_done else "there is no checkpoint yet: beginning again")
             stop_signals.note()
