@@ -218,10 +218,10 @@ def test_outcomes_by_hand(by_hand):
     assert (better.seeds_reaching_95, better.relative_cost, better.verdict()) == (2, 0.5, "better")
 
 
-def test_levers_are_compared_within_the_first_life_of_the_agent(tmp_path):
-    (setting,) = settings_of(tmp_path, tasks=["fixed-1"], levers=[], seeds=(0, 1))
+def test_levers_are_compared_within_the_first_life_of_the_agent():
     recipe = preset("hindrl", env="FixedGridPickAndPlace")
-    assert setting.spec.config == dataclasses.replace(recipe, steps=80_000, agent_resets=())
+    assert ablation._first_life(recipe) == dataclasses.replace(recipe, steps=80_000, agent_resets=())
+    assert ablation._first_life(TINY) == TINY
 
 
 def test_without_its_baseline_a_task_has_no_outcomes(by_hand):
