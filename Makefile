@@ -30,7 +30,7 @@ lint: .venv/.installed-test
 
 docs: .venv/.installed-test  ## site/index.html; a warning is an error
 	.venv/bin/python docs/generate.py
-	NO_MKDOCS_2_WARNING=1 .venv/bin/python -m mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 .venv/bin/python -m mkdocs build --strict
 
 package: .venv/.installed-test  ## wheel and sdist in dist/, each tried in an environment of its own
 	rm -rf build/lib dist

@@ -36,7 +36,7 @@ def site(tmp_path_factory):
     for name in ("hindrl_jax", "envs", "experts"):
         (folder / name).symlink_to(ROOT / name)
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1", "JAX_PLATFORMS": "cpu"}
-    for command in (["docs/generate.py"], ["-m", "mkdocs", "build", "--strict", "--quiet"]):
+    for command in (["docs/generate.py"], ["-m", "mkdocs", "build", "--strict"]):  # with --quiet, warnings would not count
         outcome = subprocess.run([sys.executable, *command], cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
         assert outcome.returncode == 0, outcome.stdout + outcome.stderr
     return folder
