@@ -96,7 +96,7 @@ def train(arguments: list[str]) -> None:
     if peek(arguments, "resume") is not None:
         options = _parse_resume(arguments, "hindrl train")
         out, spec = options.resume, read_spec(options.resume)
-        if (out / SUMMARY).exists():
+        if (out / SUMMARY).exists() and not (out / CHECKPOINTS).exists():
             raise UserError(f"{out} is finished, so there is nothing to resume: look at it with `hindrl eval {out}`")
         writer = RunWriter(out, spec, resume=True, reporters=_reporters(options, out))
     else:
@@ -117,7 +117,7 @@ def sweep(arguments: list[str]) -> None:
     if peek(arguments, "resume") is not None:
         options = _parse_resume(arguments, "hindrl sweep")
         out, (spec, settings) = options.resume, read_sweep(options.resume)
-        if (out / SWEEP).exists():
+        if (out / SWEEP).exists() and not (out / CHECKPOINTS).exists():
             raise UserError(f"{out} is finished, so there is nothing to resume: look at {out / SWEEP}")
         writer = SweepWriter(out, spec, settings, resume=True, reporters=_reporters(options, out))
     else:
