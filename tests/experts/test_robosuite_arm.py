@@ -304,7 +304,7 @@ def test_a_device_needs_a_robot(tmp_path, capsys):
 
 
 def test_a_place_that_cannot_be_written_is_refused_before_anybody_plays(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(cli, "record_by_hand", lambda *_, **__: pytest.fail("somebody played for nothing"))
+    monkeypatch.setattr("hindrl_jax.cli.demonstrations.record_by_hand", lambda *_, **__: pytest.fail("somebody played for nothing"))
     (tmp_path / "file").touch()
     arguments = ["demos", "record", "--env", COARSE.name, "--device", "keyboard", "--demos", "1", "--overwrite", "--out"]
     assert "is a folder" in refusal(capsys, *arguments, tmp_path)
