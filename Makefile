@@ -8,7 +8,7 @@ TORCH = torch torchvision
 
 .PHONY: train test test-slow test-interop coverage lint docs package bench clean
 
-train: .venv/.installed  ## one demonstration, one seed, about a minute
+train: .venv/.installed  ## one demonstration, one seed, about a minute and a half
 	.venv/bin/hindrl train --env FixedGridPickAndPlace --algo hindrl --demos 1 --seed 2 --out runs/quickstart --overwrite
 
 test: .venv/.installed-test  ## two files at a time; more would need 5 GiB of memory each
