@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import io
 import logging
 import os
 import shutil
@@ -25,6 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hindrl_jax.datasets import write_atomically
 from hindrl_jax.errors import UserError, one_line
 from hindrl_jax.experiment import Result, Row
 from hindrl_jax.types import Episodes
@@ -101,14 +103,12 @@ class Checkpoints:
         target = {name: _plain_shape(leaf) for name, leaf in shapes.items()}
         with self._damage(path), ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
             progress = checkpointer.restore(path, args=ocp.args.Composite(progress=ocp.args.JsonRestore())).progress
-        with self._damage(path):
             layout, found = progress["layout"], dict(progress["shapes"])
         if layout != LAYOUT:
             raise UserError(f"{path} has layout {layout}, and this version of hindrl_jax reads {LAYOUT}: go on with the version that wrote it")
         _check_shapes(path, found, _shapes(target))
-        with self._damage(path):
-            with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
-                arrays = checkpointer.restore(path, args=ocp.args.Composite(arrays=ocp.args.StandardRestore(target))).arrays
+        with self._damage(path), ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
+            arrays = checkpointer.restore(path, args=ocp.args.Composite(arrays=ocp.args.StandardRestore(target))).arrays
             leaves = [_as(shapes[name], arrays[name]) for name in shapes]
             guidance, state, key = jax.tree.unflatten(jax.tree.structure(_trees(begun)), leaves)
             restored = dataclasses.replace(
@@ -135,11 +135,9 @@ class Checkpoints:
         """
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *tables)
         fields = {field.name: getattr(stacked, field.name) for field in dataclasses.fields(Episodes)}
-        with self._disk_trouble():
-            self.folder.mkdir(parents=True, exist_ok=True)
-            temporary = self.folder / f"partial_{DEMONSTRATIONS}"
-            np.savez(temporary, **{name: array for name, array in fields.items() if array is not None})
-            os.replace(temporary, self.folder / DEMONSTRATIONS)
+        content = io.BytesIO()
+        np.savez(content, **{name: array for name, array in fields.items() if array is not None})
+        write_atomically(self.folder / DEMONSTRATIONS, content.getbuffer(), overwrite=True)
 
     @property
     def has_demonstrations(self) -> bool:

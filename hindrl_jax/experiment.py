@@ -183,8 +183,8 @@ def check_trainable(env: RestorableEnvironment) -> None:
         raise UserError(f"{env.name} cannot be trained in robosuite, which steps one arm outside JAX: train with backend closed_form or mjx")
 
 
-def check_goals(env: RestorableEnvironment, config: TrainConfig) -> None:
-    """Makes sure that the environment can give what the config asks of episodes.
+def check_config(env: RestorableEnvironment, config: TrainConfig) -> None:
+    """Makes sure that the environment can give what the config asks for.
 
     Raises:
       UserError: if not.
@@ -202,6 +202,8 @@ def check_goals(env: RestorableEnvironment, config: TrainConfig) -> None:
         )
     if config.demo_reset_ratio > 0.0:
         raise UserError(f"demo_reset_ratio = {config.demo_reset_ratio} cannot be had in {env.name}, whose states are not known: set it to 0")
+    if config.agent_resets:
+        raise UserError(f"agent_resets = {config.agent_resets} is for environments in JAX, which {env.name} is not: set it to ()")
 
 
 def steps_to_learn(env: RestorableEnvironment, config: TrainConfig) -> int:
@@ -255,7 +257,7 @@ def fit(
     tables = _demonstrations_per_seed(demonstrations, seeds, env)
     configs = _configs_per_seed(config, seeds)
     config = configs[0]
-    check_goals(env, config)
+    check_config(env, config)
     if config.goal.misalign_demo_actions and int(tables.lengths.min()) < 2:
         raise UserError("misalign_demo_actions needs demonstrations of at least 2 steps: turn it off or record others")
 

@@ -71,12 +71,10 @@ class HostPrograms:
           warm_up: iterations of `collect`.
 
         Raises:
-          UserError: if there are several hosts, or the agent is to begin anew.
+          UserError: if there are several hosts.
         """
         if jax.process_count() > 1:
             raise UserError(f"{env.name} is stepped by one host only: drop --distributed")
-        if configs[0].agent_resets:
-            raise UserError(f"agent_resets = {configs[0].agent_resets} is for environments in JAX, which {env.name} is not: set it to ()")
         self.env, self.config, self.values, self.chunk, self.warm_up = env, configs[0], values, chunk, warm_up
         self.mesh, self.steps_at_random = seed_mesh(len(configs)), warm_up * self.config.num_envs
         self._shape = (len(configs), self.config.num_envs)

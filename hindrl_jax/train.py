@@ -172,8 +172,10 @@ def _progress(state: TrainState, config: TrainConfig) -> Array:
 
 def _agent_schedule(state: TrainState, config: TrainConfig, updates: Array, env: Environment) -> agents.Schedule:
     """What holds for the agent at that number of updates: its schedules span the time between two resets."""
-    begins, ends = (jnp.asarray(shares)[state.resets] for shares in ((0.0, *config.agent_resets), (*config.agent_resets, 1.0)))
-    progress = jnp.clip((_progress(state, config) - begins) / (ends - begins), 0.0, 1.0) if config.agent_resets else _progress(state, config)
+    progress = _progress(state, config)
+    if config.agent_resets:
+        begins, ends = (jnp.asarray(shares)[state.resets] for shares in ((0.0, *config.agent_resets), (*config.agent_resets, 1.0)))
+        progress = jnp.clip((progress - begins) / (ends - begins), 0.0, 1.0)
     return agents.schedule(progress, updates - state.updates_at_reset, config.agent, action_dim=env.action_dim)
 
 

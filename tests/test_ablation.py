@@ -11,12 +11,13 @@ from typing import get_args
 import jax
 import numpy as np
 import pytest
+from commands import refusal
 from PIL import Image
+from tiny import CONFIG
 
 from hindrl_jax import ablation, cli
 from hindrl_jax import train as training
 from hindrl_jax.ablation import ABLATION_TASKS, BASELINE, LEVERS, AblationTask, Lever, apply, outcomes_of, settings_of, success_along
-from hindrl_jax.config import AgentConfig, BatchConfig, TrainConfig
 from hindrl_jax.errors import UserError
 from hindrl_jax.experiment import record_demonstrations
 from hindrl_jax.presets import preset
@@ -24,17 +25,7 @@ from hindrl_jax.registry import make
 from hindrl_jax.runs import read_spec
 from hindrl_jax.statistics import Interval, bootstrap
 
-TINY = TrainConfig(
-    steps=80,
-    num_envs=2,
-    updates_per_iteration=1,
-    learning_starts=40,
-    buffer_size=200,
-    eval_every=20,
-    eval_episodes=100,
-    batch=BatchConfig(batch_size=8, n_step=2),
-    agent=AgentConfig(net_arch=(4,), num_quantiles=3, top_quantiles_to_drop_per_net=1),
-)
+TINY = dataclasses.replace(CONFIG, steps=80, eval_episodes=100)
 SMALL = AblationTask("FixedGridPickAndPlace", (("num_objects", 1), ("size", 4), ("random_box_size", 1), ("horizon", 20)), 1)
 
 LEVER = next(lever for lever in LEVERS if lever.name == "n-step-1")
@@ -49,20 +40,12 @@ def tiny():
         yield
 
 
+def command(out, *arguments):
+    return ["reproduce", "ablation", "--out", str(out), "--seeds", "2", "--seed", "7", *arguments]
+
+
 def run(out, *arguments):
-    cli.main(["reproduce", "ablation", "--out", str(out), "--seeds", "2", "--seed", "7", *arguments])
-
-
-def refusal(capsys, out, *arguments) -> str:
-    """Runs an ablation that must be refused; returns its one line."""
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as stop:
-        run(out, *arguments)
-    assert stop.value.code == 2
-    printed = capsys.readouterr().err
-    assert printed.startswith("hindrl: ")
-    assert printed.count("\n") == 1, printed
-    return printed
+    cli.main(command(out, *arguments))
 
 
 @pytest.fixture(scope="module")
@@ -303,8 +286,8 @@ def test_what_is_interrupted_is_trained_again_and_said_in_a_line(finished, tmp_p
 
 def test_runs_of_other_options_are_refused_and_replaced_only_on_request(finished, capsys):
     before = contents(finished)
-    assert "default holds a run of other options (config.steps)" in refusal(capsys, finished, "--levers", "n-step-3", "--steps", "100")
-    assert "default holds a run of other options (seeds)" in refusal(capsys, finished, "--levers", "n-step-3", "--seed", "9")
+    assert "default holds a run of other options (config.steps)" in refusal(capsys, *command(finished, "--levers", "n-step-3", "--steps", "100"))
+    assert "default holds a run of other options (seeds)" in refusal(capsys, *command(finished, "--levers", "n-step-3", "--seed", "9"))
     assert contents(finished) == before
     others = settings_of(finished, tasks=["small"], levers=[], seeds=(7, 9))
     ablation.check_can_train(others, overwrite=True)
@@ -314,7 +297,7 @@ def test_runs_of_other_options_are_refused_and_replaced_only_on_request(finished
 def test_files_that_are_not_ours_are_not_replaced(tmp_path, capsys):
     (tmp_path / "small" / "default").mkdir(parents=True)
     (tmp_path / "small" / "default" / "summary.json").write_text("mine")
-    assert "summary.json" in refusal(capsys, tmp_path)
+    assert "summary.json" in refusal(capsys, *command(tmp_path))
     assert (tmp_path / "small" / "default" / "summary.json").read_text() == "mine"
 
 
@@ -331,7 +314,7 @@ def test_files_that_are_not_ours_are_not_replaced(tmp_path, capsys):
     ],
 )
 def test_bad_input_is_one_line_and_writes_nothing(arguments, message, tmp_path, capsys):
-    assert message in refusal(capsys, tmp_path / "out", *arguments)
+    assert message in refusal(capsys, *command(tmp_path / "out", *arguments))
     assert not (tmp_path / "out").exists()
 
 

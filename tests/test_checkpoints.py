@@ -14,27 +14,17 @@ import time
 import jax
 import numpy as np
 import pytest
+import tiny
 from jax.experimental.compilation_cache import compilation_cache
+from tiny import ENV
 
 import hindrl_jax as hindrl
 from hindrl_jax import cli, devices, experiment
 from hindrl_jax.checkpoints import Checkpoints
-from hindrl_jax.config import AgentConfig, BatchConfig, TrainConfig
 from hindrl_jax.progress import ProgressBar
 from hindrl_jax.runs import RunSpec, RunWriter
 
-ENV = hindrl.make("FixedGridPickAndPlace", size=4, random_box_size=1, horizon=20)
-CONFIG = TrainConfig(
-    steps=84,
-    num_envs=2,
-    updates_per_iteration=1,
-    learning_starts=40,
-    buffer_size=200,
-    eval_every=20,
-    eval_episodes=4,
-    batch=BatchConfig(batch_size=8, n_step=2),
-    agent=AgentConfig(net_arch=(4,), num_quantiles=3, top_quantiles_to_drop_per_net=1),
-)
+CONFIG = dataclasses.replace(tiny.CONFIG, steps=84)
 PRIORITISED = dataclasses.replace(CONFIG, batch=dataclasses.replace(CONFIG.batch, priority_exponent=0.6))
 CLONING = dataclasses.replace(CONFIG, algo="bc", steps=60)
 SEEDS = (3, 4)

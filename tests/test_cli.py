@@ -16,6 +16,7 @@ import h5py
 import jax
 import numpy as np
 import pytest
+from commands import refusal
 from PIL import Image
 
 from hindrl_jax import cli
@@ -45,19 +46,6 @@ def demos_file(tmp_path):
     path = tmp_path / "demos.hdf5"
     cli.main(["demos", "record", "--env", "FixedGridPickAndPlace", "--demos", "2", "--out", str(path)])
     return path
-
-
-def refusal(capsys, *arguments) -> str:
-    """Runs a command that must be refused; returns its one line."""
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as stop:
-        cli.main([str(argument) for argument in arguments])
-    assert stop.value.code == 2
-    printed = capsys.readouterr()
-    assert printed.err.startswith("hindrl: ")
-    assert printed.err.count("\n") == 1, printed.err
-    assert "Traceback" not in printed.err
-    return printed.err
 
 
 def test_options_that_change_nothing_are_warned_about():

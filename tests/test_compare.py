@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from commands import refusal
 
 import hindrl_jax as hindrl
 from hindrl_jax import cli
@@ -35,15 +36,6 @@ def write(path, success, *, final=None, seeds=(0, 1), algo="hindrl", env=ENV, ev
 @pytest.fixture
 def first(tmp_path):
     return write(tmp_path / "first", [[0.5, 0.95, 0.9], [0.0, 0.5, 0.96]], final=[0.9, 1.0])
-
-
-def refusal(capsys, *arguments):
-    with pytest.raises(SystemExit) as stop:
-        cli.main(["compare", *map(str, arguments)])
-    assert stop.value.code == 2
-    printed = capsys.readouterr()
-    assert printed.err.count("\n") == 1
-    return printed.err
 
 
 def test_figures_of_a_run(first):
@@ -130,15 +122,15 @@ def test_the_command_prints_a_table_and_writes_what_it_is_asked_for(first, tmp_p
 
 def test_what_cannot_be_compared_is_one_line(first, tmp_path, capsys):
     assert "give the directories of two or more runs" in refusal(capsys)
-    assert "is not the directory of a run, nor of several" in refusal(capsys, first, tmp_path / "nowhere")
-    assert "must end in .png" in refusal(capsys, first, "--to", tmp_path / "runs.pdf")
-    assert "no folder" in refusal(capsys, first, "--csv", tmp_path / "nowhere" / "runs.csv")
+    assert "is not the directory of a run, nor of several" in refusal(capsys, "compare", first, tmp_path / "nowhere")
+    assert "must end in .png" in refusal(capsys, "compare", first, "--to", tmp_path / "runs.pdf")
+    assert "no folder" in refusal(capsys, "compare", first, "--csv", tmp_path / "nowhere" / "runs.csv")
     early = write(tmp_path / "early", [[], []])
-    assert "no evaluation of all its seeds yet" in refusal(capsys, first, early)
+    assert "no evaluation of all its seeds yet" in refusal(capsys, "compare", first, early)
     (early / "metrics.csv").unlink()
-    assert "has no metrics.csv yet" in refusal(capsys, first, early)
+    assert "has no metrics.csv yet" in refusal(capsys, "compare", first, early)
     (early / "metrics.csv").write_text("seed,env_steps\n0,x\n")
-    assert "is damaged" in refusal(capsys, first, early)
+    assert "is damaged" in refusal(capsys, "compare", first, early)
     with pytest.raises(hindrl.UserError, match="cannot write"):
         write_csv(compare(read_runs([first])), tmp_path)
 

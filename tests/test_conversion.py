@@ -20,6 +20,7 @@ import jax
 import minari
 import numpy as np
 import pytest
+from commands import refusal as command_refusal
 
 from hindrl_jax import cli
 from hindrl_jax.conversion import Interpretation, load, read, restore, write
@@ -554,28 +555,18 @@ def test_what_is_no_archive(tmp_path):
 # The command line
 
 
-def says(capsys, *arguments):
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as stop:
-        cli.main([str(argument) for argument in arguments])
-    assert stop.value.code == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    return error
-
-
 def test_refusals_write_nothing(recorded, tmp_path, capsys):
     ours, other = tmp_path / "ours.hdf5", tmp_path / "other.npz"
     other.write_text("mine")
     convert = ("demos", "convert")
-    assert "exists already" in says(capsys, *convert, recorded, other)
-    assert "does not say a format" in says(capsys, *convert, recorded, tmp_path / "demos")
-    assert "leave out --env" in says(capsys, *convert, recorded, ours, "--env", "GridPickAndPlace")
-    assert "leave out --env" in says(capsys, *convert, ROBOMIMIC_FILE, ours, "--env", "GridPickAndPlace", "--observation-keys", *KEYS)
-    assert "leave out the options" in says(capsys, *convert, recorded, ours, "--solved", "all")
-    assert "not converted from a robomimic file" in says(capsys, *convert, recorded, ours, "--restore")
-    assert "no such file" in says(capsys, *convert, tmp_path / "missing.hdf5", ours)
-    assert "--observation-keys" in says(capsys, *convert, ROBOMIMIC_FILE, ours)
+    assert "exists already" in command_refusal(capsys, *convert, recorded, other)
+    assert "does not say a format" in command_refusal(capsys, *convert, recorded, tmp_path / "demos")
+    assert "leave out --env" in command_refusal(capsys, *convert, recorded, ours, "--env", "GridPickAndPlace")
+    assert "leave out --env" in command_refusal(capsys, *convert, ROBOMIMIC_FILE, ours, "--env", "GridPickAndPlace", "--observation-keys", *KEYS)
+    assert "leave out the options" in command_refusal(capsys, *convert, recorded, ours, "--solved", "all")
+    assert "not converted from a robomimic file" in command_refusal(capsys, *convert, recorded, ours, "--restore")
+    assert "no such file" in command_refusal(capsys, *convert, tmp_path / "missing.hdf5", ours)
+    assert "--observation-keys" in command_refusal(capsys, *convert, ROBOMIMIC_FILE, ours)
     assert [path.name for path in tmp_path.iterdir()] == ["other.npz"]
     assert other.read_text() == "mine"
 

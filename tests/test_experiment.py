@@ -9,24 +9,12 @@ from types import SimpleNamespace
 import chex
 import numpy as np
 import pytest
+from tiny import CONFIG, ENV
 
 import hindrl_jax as hindrl
 from hindrl_jax import films, runs
-from hindrl_jax.config import SWEEPABLE, AgentConfig, BatchConfig, GoalConfig, TrainConfig, sweepable_value, with_values
+from hindrl_jax.config import SWEEPABLE, GoalConfig, sweepable_value, with_values
 from hindrl_jax.experiment import Result, Row
-
-ENV = hindrl.make("FixedGridPickAndPlace", size=4, random_box_size=1, horizon=20)
-CONFIG = TrainConfig(
-    steps=60,
-    num_envs=2,
-    updates_per_iteration=1,
-    learning_starts=40,
-    buffer_size=200,
-    eval_every=20,
-    eval_episodes=4,
-    batch=BatchConfig(batch_size=8, n_step=2),
-    agent=AgentConfig(net_arch=(4,), num_quantiles=3, top_quantiles_to_drop_per_net=1),
-)
 
 
 @pytest.fixture(scope="module")

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 from rich import box
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from hindrl_jax import ablation
 from hindrl_jax.cli.common import console, counted, parse, seeds_from
-from hindrl_jax.cli.progress import add_bar, advance, progress_bars
 from hindrl_jax.errors import UserError
-from hindrl_jax.experiment import steps_to_learn
+from hindrl_jax.experiment import Result, steps_to_learn
 from hindrl_jax.registry import did_you_mean
 
 
@@ -65,11 +65,11 @@ def ablate(arguments: list[str]) -> None:
     console.print(f"{counted(len(to_train), 'setting')} to train, {counted(options.seeds, 'seed')} from {options.seed}, {kept} finished before")
 
     started = time.perf_counter()
-    with progress_bars(transient=True) as progress:
+    with _bars() as progress:
         for trained, setting in enumerate(to_train, 1):
             name = f"{setting.task} {setting.lever.name}: "
-            bar = add_bar(progress, setting.spec.config, name=name)
-            ablation.train(setting, report=functools.partial(advance, progress, bar, name=name))
+            bar = progress.add_task(f"{name}compiling", total=setting.spec.config.steps, rates="")
+            ablation.train(setting, report=functools.partial(_advance, progress, bar, name))
             progress.remove_task(bar)
             outcomes = ablation.outcomes_of(everything)
             ablation.write_tables(options.out, outcomes)
@@ -80,6 +80,24 @@ def ablate(arguments: list[str]) -> None:
     if not to_train:
         ablation.write_tables(options.out, ablation.outcomes_of(everything))
     console.print(f"wrote {options.out}: {ablation.TABLE}, {ablation.TEXT}, {ablation.PICTURE}, and a run's directory for each setting")
+
+
+def _bars() -> Progress:
+    """A place for the bars of trainings that follow each other; `hindrl_jax.progress` has that of a single one."""
+    columns = ("{task.description}", BarColumn(), "{task.completed:,.0f}/{task.total:,.0f} steps", "{task.fields[rates]}", "left")
+    return Progress(*(TextColumn(c) if isinstance(c, str) else c for c in columns), TimeRemainingColumn(), console=console, transient=True)
+
+
+def _advance(progress: Progress, bar: TaskID, name: str, result: Result) -> None:
+    """Brings the bar of a training up to date."""
+    success, runs, seconds = result.latest_success(), len(result.seeds), max(result.train_seconds, 1e-9)
+    rates = f"{runs * result.env_steps / seconds:,.0f} steps/s, {runs * result.updates / seconds:,.0f} updates/s"
+    progress.update(
+        bar,
+        completed=min(result.steps_done, result.config.steps),
+        description=name + ("training" if success is None else f"success {success:4.0%}"),
+        rates=rates if result.train_seconds else "",
+    )
 
 
 def _chosen(names: Sequence[str], known: Iterable[str], flag: str) -> list[str]:

@@ -27,7 +27,7 @@ from hindrl_jax.cli.common import ENV_HELP, console, counted, env_names, parse, 
 from hindrl_jax.config import SWEEPABLE, TrainConfig, without_effect
 from hindrl_jax.conversion import MINARI_PREFIX, load
 from hindrl_jax.errors import UserError, one_line
-from hindrl_jax.experiment import Diverged, Result, check_goals, check_trainable, fit, record_demonstrations
+from hindrl_jax.experiment import Diverged, Result, check_config, check_trainable, fit, record_demonstrations
 from hindrl_jax.presets import ORIGINAL_RULES, Preset, preset
 from hindrl_jax.progress import ProgressBar
 from hindrl_jax.registry import checked, did_you_mean, make, task
@@ -96,8 +96,7 @@ def train(arguments: list[str]) -> None:
     if peek(arguments, "resume") is not None:
         options = _parse_resume(arguments, "hindrl train")
         out, spec = options.resume, read_spec(options.resume)
-        if (out / SUMMARY).exists() and not (out / CHECKPOINTS).exists():
-            raise UserError(f"{out} is finished, so there is nothing to resume: look at it with `hindrl eval {out}`")
+        _check_unfinished(out, SUMMARY, f"look at it with `hindrl eval {out}`")
         writer = RunWriter(out, spec, resume=True, reporters=_reporters(options, out))
     else:
         spec, options = parse_train(arguments)
@@ -117,8 +116,7 @@ def sweep(arguments: list[str]) -> None:
     if peek(arguments, "resume") is not None:
         options = _parse_resume(arguments, "hindrl sweep")
         out, (spec, settings) = options.resume, read_sweep(options.resume)
-        if (out / SWEEP).exists() and not (out / CHECKPOINTS).exists():
-            raise UserError(f"{out} is finished, so there is nothing to resume: look at {out / SWEEP}")
+        _check_unfinished(out, SWEEP, f"look at {out / SWEEP}")
         writer = SweepWriter(out, spec, settings, resume=True, reporters=_reporters(options, out))
     else:
         spec, options = parse_train(arguments, SweepOptions, "hindrl sweep")
@@ -135,6 +133,12 @@ def sweep(arguments: list[str]) -> None:
 
 def _parse_resume(arguments: list[str], program: str) -> ResumeOptions:
     return parse(ResumeOptions, arguments, f"{program} --resume DIRECTORY", "Go on with what was stopped or killed.")
+
+
+def _check_unfinished(out: Path, last: str, advice: str) -> None:
+    """Refuses to resume what has all its files; the checkpoint is removed after the last of them."""
+    if (out / last).exists() and not (out / CHECKPOINTS).exists():
+        raise UserError(f"{out} is finished, so there is nothing to resume: {advice}")
 
 
 def _checkpoints(out: Path, options: TrainOptions | ResumeOptions) -> Checkpoints | None:
@@ -360,7 +364,7 @@ def parse_train(arguments: list[str], options_class: type[TrainOptions] = TrainO
     )
     parsed = parse(namespace, arguments, program, train.__doc__ if options_class is TrainOptions else sweep.__doc__)
     check_trainable(parsed.environment)
-    check_goals(parsed.environment, parsed.training)
+    check_config(parsed.environment, parsed.training)
     _warn_of_what_has_no_effect(spec.config, parsed.training)
     options = parsed.options
     seeds = spec.seeds

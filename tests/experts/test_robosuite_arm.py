@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from commands import refusal
 from kinematic_arm import KinematicArm, KinematicReach
 from toy_env import FAST_COMPILATION
 
@@ -267,18 +268,6 @@ def test_recorded_from_the_command_line(arm, tmp_path, capsys):
 
 
 # --- training and evaluating
-
-
-def refusal(capsys, *arguments):
-    """Runs a command that must be refused; returns its one line."""
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as stop:
-        cli.main([str(argument) for argument in arguments])
-    assert stop.value.code == 2
-    printed = capsys.readouterr().err
-    assert printed.startswith("hindrl: ")
-    assert printed.count("\n") == 1
-    return printed
 
 
 @pytest.mark.parametrize("command", [["train"], ["sweep", "--over", "gamma=0.9,0.8"]], ids=lambda command: command[0])
