@@ -121,7 +121,7 @@ def test_the_command_prints_a_table_and_writes_what_it_is_asked_for(first, tmp_p
 
 
 def test_what_cannot_be_compared_is_one_line(first, tmp_path, capsys):
-    assert "give the directories of two or more runs" in refusal(capsys)
+    assert "give the directories of two or more runs" in refusal(capsys, "compare")
     assert "is not the directory of a run, nor of several" in refusal(capsys, "compare", first, tmp_path / "nowhere")
     assert "must end in .png" in refusal(capsys, "compare", first, "--to", tmp_path / "runs.pdf")
     assert "no folder" in refusal(capsys, "compare", first, "--csv", tmp_path / "nowhere" / "runs.csv")
