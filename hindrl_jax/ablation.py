@@ -141,6 +141,7 @@ LEVERS: tuple[Lever, ...] = (
         (("agent.q_filter", True), ("agent.bc_weight", 0.1)),
     ),
     Lever("value-normalised", "demonstrations", "value in the actor's loss over its mean size (TD3+BC)", (("agent.normalise_value", True),)),
+    Lever("value-relative", "demonstrations", "value in the actor's loss over its own size, row by row", (("agent.relative_value", True),)),
     Lever("bc-warm-start", "demonstrations", "500 gradient steps of cloning before the first of reinforcement learning", (("bc_warm_start", 500),)),
     Lever("pretraining", "demonstrations", "500 gradient steps on demonstrations alone at first (DQfD, DDPGfD)", (("pretrain_updates", 500),)),
     Lever("bc-norm", "demonstrations", "cloning loss is the distance, not its square (original code)", (("agent.bc_loss", "norm"),)),

@@ -45,6 +45,7 @@ _ADAM = optax.scale_by_adam()  # the step size is applied apart, since it may ch
 
 
 _LEAST_EXTENT = 1e-6
+_LEAST_VALUE = 0.01
 
 
 class InputScale(struct.PyTreeNode, kw_only=True):
@@ -228,7 +229,8 @@ def update(
     Critic: quantile Huber loss towards the truncated atoms of r + discount (Z' - alpha log pi(a' | s')); for algorithms without quantiles the
       squared error to r + discount (min Q' - alpha log pi(a' | s')).
     Actor: mean(alpha log pi - value(s, a_pi)) + bc_weight * behaviour cloning loss; the value is the mean over critics and quantiles (tqc), the
-      least critic's (sac; with REDQ's subsets the mean over critics) or the first one's (td3, ddpg).
+      least critic's (sac; with REDQ's subsets the mean over critics) or the first one's (td3, ddpg). With `normalise_value` or `relative_value` it
+      is divided by its size, and there is no alpha in the critics' targets, whose units are others.
 
     Args:
       key: random key.
@@ -330,7 +332,8 @@ def _next_action(state: AgentState, config: AgentConfig, block: _Columns) -> tup
     action_dim = block.action.shape[0]
     if config.has_entropy:
         action, log_prob = apply_actor(state.actor, block.next_inputs, config, action_dim=action_dim).at(block.next_noise)
-        return action, -jnp.exp(state.log_alpha) * log_prob
+        weighed_as_rewards = not (config.normalise_value or config.relative_value)
+        return action, -jnp.exp(state.log_alpha) * log_prob if weighed_as_rewards else jnp.zeros_like(log_prob)
     action = apply_actor(state.target_actor, block.next_inputs, config, action_dim=action_dim).mode
     if config.base == "td3":
         noise = jnp.clip(config.target_noise * block.next_noise, -config.target_noise_clip, config.target_noise_clip)
@@ -358,17 +361,26 @@ def _actor_gradient(state: AgentState, schedule: Schedule, config: AgentConfig, 
             action, log_prob = distribution.mode, jnp.zeros(block.reward.shape)
         values = _value(state.critics, block.inputs, action, config)
         value, entropy = jnp.mean(values), -jnp.mean(log_prob)
-        size = jnp.maximum(jax.lax.stop_gradient(jnp.mean(jnp.abs(values))), _LEAST_EXTENT) if config.normalise_value else 1.0
         cloned = distribution.mode if config.bc_action == "mean" else action
         clonable = block.is_demonstration
         if config.q_filter:
             own = _value(state.critics, block.inputs, jax.lax.stop_gradient(distribution.mode), config)
             clonable &= _value(state.critics, block.inputs, block.action, config) > own
         bc = behaviour_cloning(cloned, block.action, clonable, form=config.bc_loss)
-        total = -jnp.exp(state.log_alpha) * entropy - value / size + schedule.bc_weight * bc
+        total = -jnp.exp(state.log_alpha) * entropy - _climbed(values, config) + schedule.bc_weight * bc
         return total, {"actor/loss": total, "actor/bc_loss": bc, "actor/value": value, "actor/entropy": entropy}
 
     return jax.grad(loss, has_aux=True)(state.actor)
+
+
+def _climbed(values: Array, config: AgentConfig) -> Array:
+    """() what the actor climbs, of the values (B,) of its actions."""
+    size: Array | float = 1.0
+    if config.normalise_value:
+        size = jnp.maximum(jnp.mean(jnp.abs(values)), _LEAST_EXTENT)
+    if config.relative_value:
+        size = jnp.maximum(values, _LEAST_VALUE)
+    return jnp.mean(values / jax.lax.stop_gradient(size))
 
 
 def _move_actor(state: AgentState, gradient: Params, entropy: Array, schedule: Schedule, config: AgentConfig) -> tuple[AgentState, Metrics]:

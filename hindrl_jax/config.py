@@ -225,7 +225,10 @@ class AgentConfig:
     """For td3: the largest noise on the actions of the targets."""
     normalise_value: bool = False
     """Divide the value in the actor's loss by its mean size over the batch, so that bc_weight weighs alike whatever the values are (TD3+BC,
-    Fujimoto and Gu, 2021). The entropy's share of the loss stays as it is."""
+    Fujimoto and Gu, 2021). The entropy's weight is then in other units than the rewards, so that the critics' targets leave entropy out."""
+    relative_value: bool = False
+    """Divide the value in the actor's loss, row by row, by its own size, or by 0.01 if that is more: as if the actor climbed the value's logarithm.
+    One step lost then weighs alike near the reward and far from it. As with normalise_value, the critics' targets leave entropy out."""
     bc_weight: float = 0.01
     """Weight of the behaviour cloning loss on demonstration rows (lambda_BC of the thesis)."""
     final_bc_weight: float | None = None
@@ -271,6 +274,8 @@ class AgentConfig:
             bc_weight=(self.bc_weight >= 0.0, "0 or more"),
             final_bc_weight=(self.final_bc_weight is None or self.final_bc_weight >= 0.0, "0 or more, or None"),
         )
+        if self.normalise_value and self.relative_value:
+            raise ValueError("normalise_value and relative_value both divide the value in the actor's loss: choose one of them")
         if self.base == "ddpg" and self.num_critics > 1:
             raise ValueError(f"ddpg has one critic, but num_critics = {self.num_critics}: set it to 1, or choose td3")
 
@@ -401,8 +406,8 @@ _CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
         "demo_returns terminate_on_relabel bound_by_obtained_return timeouts_are_terminal importance_exponent demo_priority_bonus "
         "achieved_goal_ratio final_achieved_goal_ratio clip_targets num_critics num_target_critics num_quantiles top_quantiles_to_drop_per_net "
         "layer_norm target_update_rate initial_alpha target_entropy final_target_entropy actor_delay exploration_noise target_noise "
-        "target_noise_clip normalise_value bc_weight final_bc_weight agent_resets num_envs updates_per_iteration learning_starts buffer_size "
-        "demo_reset_ratio demo_reset_curriculum",
+        "target_noise_clip normalise_value relative_value bc_weight final_bc_weight agent_resets num_envs updates_per_iteration learning_starts "
+        "buffer_size demo_reset_ratio demo_reset_curriculum",
         lambda config: config.algo != "bc",
         "behaviour cloning does not use it: choose another algo",
     ),

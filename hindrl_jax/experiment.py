@@ -24,7 +24,7 @@ from hindrl_jax.host import FRESH_EPISODES, HostPrograms, record_gymnasium
 from hindrl_jax.registry import task
 from hindrl_jax.rollout import Evaluation
 from hindrl_jax.train import Guidance, TrainState
-from hindrl_jax.types import Array, Episodes, RestorableEnvironment, compiler_options
+from hindrl_jax.types import Array, Episodes, RestorableEnvironment, RetellableEnvironment, compiler_options
 
 SOLVED = 0.95
 CHUNKS_PER_EVALUATION = 10
@@ -194,6 +194,8 @@ def check_config(env: RestorableEnvironment, config: TrainConfig) -> None:
             raise UserError(
                 f"behavioural_goals = environment is for Gymnasium's environments: {env.name} gives its episodes no goals; choose another"
             )
+        if isinstance(env, RetellableEnvironment) and "joint_intersection" in dict(config.batch.sources):
+            raise UserError(f"joint_intersection compares goals, and hindsight changes none in {env.name}: choose another hindrl_sampling_strategy")
         return
     if config.goal.behavioural_goals != "environment":
         raise UserError(

@@ -96,6 +96,7 @@ class GoalTable(struct.PyTreeNode, kw_only=True):
 
     goals: Array  # (M, G) float32; rows from `count` on are padding
     count: Array  # () int32, 1 <= count <= M
+    observations: Array | None = None  # (M, D) where they were reached; None where only the goals matter
 
 
 def is_visited(lengths: Array, num_states: int) -> Array:
@@ -104,7 +105,14 @@ def is_visited(lengths: Array, num_states: int) -> Array:
 
 
 def goal_table(
-    achieved_goals: Array, lengths: Array, epsilon: Array, *, filtered: bool, exclude_last: bool = False, inclusive: bool = True
+    achieved_goals: Array,
+    lengths: Array,
+    epsilon: Array,
+    *,
+    filtered: bool,
+    exclude_last: bool = False,
+    inclusive: bool = True,
+    observations: Array | None = None,
 ) -> GoalTable:
     """Collects the goals that the demonstrations reach: the database G_db of the thesis, smoothed or not.
 
@@ -115,6 +123,7 @@ def goal_table(
       filtered: apply `epsilon_filter` (Smooth HinDRL).
       exclude_last: leave out the last goal of each demonstration, as the original code does by mistake.
       inclusive: which box test the filter uses.
+      observations: (N, T + 1, D) to keep beside the goals, if any.
 
     Returns:
       A table with M = N * (T + 1) rows, of which `count` are goals.
@@ -124,7 +133,11 @@ def goal_table(
         keep &= jax.vmap(lambda goals: epsilon_filter(goals, epsilon, inclusive=inclusive))(achieved_goals)
     keep = keep.reshape(-1)
     order = jnp.argsort(~keep, stable=True)
-    return GoalTable(goals=achieved_goals.reshape(-1, achieved_goals.shape[-1])[order], count=jnp.sum(keep))
+
+    def kept(values: Array) -> Array:
+        return values.reshape(-1, values.shape[-1])[order]
+
+    return GoalTable(goals=kept(achieved_goals), count=jnp.sum(keep), observations=None if observations is None else kept(observations))
 
 
 def final_goals(achieved_goals: Array, lengths: Array) -> GoalTable:

@@ -37,11 +37,13 @@ def preset(algo: Algorithm = "hindrl", name: Preset = "default", *, env: str | E
     for value, kind, known in ((algo, "algorithm", get_args(Algorithm)), (name, "preset", get_args(Preset))):
         if value not in known:
             raise UserError(f"unknown {kind} {value!r}{did_you_mean(value, known)}; choose one of {', '.join(known)}")
-    family = task(env if isinstance(env, str) else env.name).family
+    environment, family = (getattr(task(env if isinstance(env, str) else env.name), field) for field in ("environment", "family"))
     if family == "gymnasium":
         if name != "default":
             raise UserError(f"the preset {name} is for the thesis's tasks: choose default for environments of Gymnasium")
         return _as_algorithm(_gymnasium(algo, make(env) if isinstance(env, str) else env), algo)
+    if name == "default" and algo != "bc" and hasattr(environment, "retell"):
+        return _as_algorithm(_retold(), algo)
     return _as_algorithm({"default": _default, "thesis": _thesis, "original": _original}[name](algo, family), algo)
 
 
@@ -88,6 +90,31 @@ def _default(algo: Algorithm, family: Family) -> TrainConfig:
             actor_average_span=0.5,
             bc_weight=0.03,
             input_encoding=encoding,
+        ),
+    )
+
+
+def _retold() -> TrainConfig:
+    """The recipe where hindsight tells what has happened anew, see `types.RetellableEnvironment`: mostly that, and little cloning."""
+    return TrainConfig(
+        steps=100_000,
+        num_envs=16,
+        updates_per_iteration=16,
+        learning_starts=4_800,
+        demo_reset_ratio=0.5,
+        eval_every=10_000,
+        batch=BatchConfig(n_step=3, max_demo_ratio=0.125, num_sampled_goals=4.0, hindrl_sampling_strategy="joint_union"),
+        goal=GoalConfig(m=5, behavioural_goals="task"),
+        agent=AgentConfig(
+            layer_norm=True,
+            final_learning_rate=1e-5,
+            clip_targets=True,
+            actor_average_rate=1.0,
+            actor_average_span=0.5,
+            final_target_entropy=-8.0,
+            relative_value=True,
+            bc_weight=0.03,
+            final_bc_weight=0.0,
         ),
     )
 

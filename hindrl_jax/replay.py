@@ -12,7 +12,7 @@ Transitions are drawn uniformly, by `sample_batch`, or by their priorities, by `
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,13 @@ from hindrl_jax.priorities import Drawn, Priorities
 from hindrl_jax.randomness import uniform_in_groups, uniform_index
 from hindrl_jax.relabel import choose_sources, hindsight_steps, intersection_steps
 from hindrl_jax.types import Array, Episodes, Transition, tree_where
+
+
+class Retelling(NamedTuple):
+    """How an environment that puts into its observations what an episode is about tells in hindsight, see `types.RetellableEnvironment`."""
+
+    retell: Callable[[Array, Array, Array], tuple[Array, Array]]
+    num_subgoals: int  # J
 
 
 class ReplayState(struct.PyTreeNode, kw_only=True):
@@ -161,23 +168,26 @@ def transitions(
     is_demonstration: bool,
     n_step: int,
     config: BatchConfig,
+    retold: tuple[Array, Callable[[Array], tuple[Array, Array]]] | None = None,
 ) -> Transition:
     """Reads n-step transitions, with the goals and rewards that they were told or have lived.
 
     The return of row i runs over the steps t, t + 1, ... of its episode. It ends after `n_step` steps, at the end of the episode, or (with
     `terminate_on_relabel`) where a relabelled goal is reached, whichever comes first. Relabelled rows are rewarded by the box test on the
-    goal achieved after each step (thesis eq. 2.29 and 4.8), the others keep the environment's reward.
+    goal achieved after each step (thesis eq. 2.29 and 4.8), retold ones where the task is then solved, the others keep the environment's reward.
 
     Args:
       episodes: the table to read.
       rows, steps: (B,) int32, episode and transition index.
       achieved_goal: projection of observations (..., D) to goals (..., G).
-      new_goals: (B, G), used where relabelled.
+      new_goals: (B, G), used where relabelled or retold.
       relabelled: (B,) bool.
       epsilon: (G,) half-width of the goal box.
       is_demonstration: marks the rows for the behaviour cloning loss.
       n_step: the largest number of steps of a return.
       config: gamma and the rules of termination.
+      retold: which rows (B,) are told anew, none of them relabelled, and how: observations (B, n + 1, D) -> what is seen in their place, and (B, n)
+        bool, whether the task is solved after each step.
 
     Returns:
       The batch. Where the return ended by termination the discount is 0, else gamma to the number of steps taken.
@@ -189,12 +199,19 @@ def transitions(
     inside = window < lengths[:, None]
     window = jnp.minimum(window, lengths[:, None] - 1)
     rewards = episodes.rewards[rows[:, None], window]
+    observations = episodes.observations[rows, steps]
     next_observations = episodes.observations[rows[:, None], window + 1]  # (B, n, D)
     reached = goal_reached(achieved_goal(next_observations), new_goals[:, None], epsilon, inclusive=config.inclusive_goal_test)
     reached &= relabelled[:, None]
-    rewards = jnp.where(relabelled[:, None], reached.astype(jnp.float32), rewards)
-
     ends = (window == lengths[:, None] - 1) & terminated[:, None]
+    if retold is not None:
+        is_retold, retell = retold
+        seen, solved = retell(jnp.concatenate([observations[:, None], next_observations], axis=1))
+        observations = jnp.where(is_retold[:, None], seen[:, 0], observations)
+        next_observations = jnp.where(is_retold[:, None, None], seen[:, 1:], next_observations)
+        reached, ends = jnp.where(is_retold[:, None], solved, reached), ends & ~is_retold[:, None]
+        relabelled |= is_retold
+    rewards = jnp.where(relabelled[:, None], reached.astype(jnp.float32), rewards)
     if config.terminate_on_relabel:
         ends |= reached
     ended_before = jnp.cumsum(ends, axis=1) - ends > 0
@@ -203,7 +220,7 @@ def transitions(
     discounts = config.gamma ** jnp.arange(n_step, dtype=jnp.float32)
     last = (num_steps - 1)[:, None]
     return Transition(
-        observation=episodes.observations[rows, steps],
+        observation=observations,
         action=episodes.actions[rows, steps],
         reward=jnp.sum(jnp.where(counted, rewards * discounts[None], 0.0), axis=1),
         discount=jnp.where(jnp.take_along_axis(ends, last, axis=1)[:, 0], 0.0, config.gamma**num_steps),
@@ -230,13 +247,22 @@ def num_demo_rows(env_steps: Array, config: BatchConfig) -> Array:
     return jnp.minimum(jnp.floor(config.max_demo_ratio * config.batch_size * remaining).astype(jnp.int32), config.max_demo_rows)
 
 
+def _by_source(key: Array, num_rows: int, config: BatchConfig, draw: Callable[[Array, Source], Any]) -> Any:
+    """For each row what draw(key, source), leaves (B, ...), has for it from the source that falls to it."""
+    sources, weights = zip(*config.sources, strict=True)
+    key_choice, *keys = jax.random.split(key, len(sources) + 1)
+    choice = choose_sources(key_choice, num_rows, weights)
+    drawn = draw(keys[0], sources[0])
+    for index in range(1, len(sources)):
+        drawn = tree_where(choice == index, draw(keys[index], sources[index]), drawn)
+    return drawn
+
+
 def _new_goals(
     key: Array, replay: ReplayState, rows: Array, steps: Array, table: GoalTable, *, achieved_goal: Callable[[Array], Array], config: BatchConfig
 ) -> tuple[Array, Array]:
     """(B, G) goals from the sources of the config, and (B,) whether there was one: only an intersection can be empty."""
     lengths, size = replay.episodes.lengths, rows.shape[0]
-    sources, weights = zip(*config.sources, strict=True)
-    key_choice, *keys = jax.random.split(key, len(sources) + 1)
 
     def reached(rows: Array, steps: Array) -> Array:
         return achieved_goal(replay.episodes.observations[rows, steps])
@@ -257,13 +283,26 @@ def _new_goals(
             return table.goals[jnp.take_along_axis(nearby, chosen[:, None], axis=1)[:, 0]], found
         return reached(rows, hindsight_steps(key_step, steps, lengths[rows], source=source)), always
 
-    choice = choose_sources(key_choice, size, weights)
-    goals, found = goals_from(keys[0], sources[0])
-    for index in range(1, len(sources)):
-        other_goals, other_found = goals_from(keys[index], sources[index])
-        goals = jnp.where((choice == index)[:, None], other_goals, goals)
-        found = jnp.where(choice == index, other_found, found)
-    return goals, found
+    return _by_source(key, size, config, goals_from)
+
+
+def _new_subgoals(key: Array, replay: ReplayState, rows: Array, steps: Array, table: GoalTable, *, num_subgoals: int, config: BatchConfig) -> Array:
+    """(B, J, D) observations of states from the sources of the config; those of the row's own episode come in the order in which it visited them."""
+    lengths, shape = replay.episodes.lengths, (rows.shape[0], num_subgoals)
+
+    def states_from(key: Array, source: Source) -> Array:
+        key_row, key_step = jax.random.split(key)
+        if source == "task_conditioned":
+            return table.observations[uniform_index(key_row, shape, table.count)]
+        if source == "random":
+            others = sample_episodes(key_row, replay, rows.shape[0] * num_subgoals).reshape(shape)
+            chosen = hindsight_steps(key_step, jnp.zeros_like(others), lengths[others], source="episode")
+            return replay.episodes.observations[others, chosen]
+        own = jnp.broadcast_to(rows[:, None], shape)
+        chosen = hindsight_steps(key_step, jnp.broadcast_to(steps[:, None], shape), lengths[own], source=source)
+        return replay.episodes.observations[own, jnp.sort(chosen, axis=1)]
+
+    return _by_source(key, rows.shape[0], config, states_from)
 
 
 def _num_relabelled(num_replay_rows: Array, config: BatchConfig) -> Array:
@@ -283,13 +322,21 @@ def _replay_rows(
     achieved_goal: Callable[[Array], Array],
     epsilon: Array,
     config: BatchConfig,
+    retelling: Retelling | None,
 ) -> Transition:
-    """Reads rows of the replay, those that are to be `relabelled` (B,) with goals of the config's sources as far as there are any."""
-    desired_goals = replay.episodes.desired_goals[rows]
-    new_goals = desired_goals
-    if config.sources:
+    """Reads rows of the replay, those that are to be `relabelled` (B,) with goals of the config's sources as far as there are any, or retold."""
+    desired_goals = new_goals = replay.episodes.desired_goals[rows]
+    judged_by_goal, retold = replay.judged_by_goal[rows], None
+    if config.sources and retelling is not None:
+        key, key_telling = jax.random.split(key)
+        keys = jax.random.split(key_telling, rows.shape[0])
+        subgoals = _new_subgoals(key, replay, rows, steps, table, num_subgoals=retelling.num_subgoals, config=config)
+        retold = relabelled, lambda observations: jax.vmap(retelling.retell)(keys, observations, subgoals)
+        judged_by_goal &= ~relabelled
+    elif config.sources:
         new_goals, found = _new_goals(key, replay, rows, steps, table, achieved_goal=achieved_goal, config=config)
         relabelled &= found
+        judged_by_goal |= relabelled
     # A row of an episode that is judged by its behavioural goal is read as if that were a goal chosen in hindsight.
     batch = transitions(
         replay.episodes,
@@ -297,11 +344,12 @@ def _replay_rows(
         steps,
         achieved_goal=achieved_goal,
         new_goals=jnp.where(relabelled[:, None], new_goals, desired_goals),
-        relabelled=relabelled | replay.judged_by_goal[rows],
+        relabelled=judged_by_goal,
         epsilon=epsilon,
         is_demonstration=False,
         n_step=config.n_step,
         config=config,
+        retold=retold,
     )
     return batch.replace(is_relabelled=relabelled)
 
@@ -334,6 +382,7 @@ def sample_batch(
     epsilon: Array,
     demo_rows: Array,
     config: BatchConfig,
+    retelling: Retelling | None = None,
 ) -> Transition:
     """Draws the batch of one gradient step: demonstrations, then relabelled replay rows, then replay rows as they were lived.
 
@@ -349,6 +398,7 @@ def sample_batch(
       epsilon: (G,) half-width of the goal box.
       demo_rows: () int32, see `num_demo_rows`.
       config: batch size, relabelled share, strategy, n-step.
+      retelling: how hindsight is told where it changes observations in place of goals; the table then holds observations, too.
 
     Returns:
       A batch of `config.batch_size` rows in that order.
@@ -360,7 +410,7 @@ def sample_batch(
     steps = sample_steps(key_step, replay.episodes, rows)
     index = jnp.arange(size)
     relabelled = (index >= demo_rows) & (index < demo_rows + _num_relabelled(size - demo_rows, config))
-    batch = _replay_rows(key_goal, replay, rows, steps, relabelled, table, **read)
+    batch = _replay_rows(key_goal, replay, rows, steps, relabelled, table, retelling=retelling, **read)
     if config.max_demo_rows == 0:
         return batch
 
@@ -380,6 +430,7 @@ def sample_prioritised_batch(
     achieved_goal: Callable[[Array], Array],
     epsilon: Array,
     config: BatchConfig,
+    retelling: Retelling | None = None,
 ) -> tuple[Transition, Drawn]:
     """Draws the batch of one gradient step by the priorities of the transitions, see `priorities`.
 
@@ -396,7 +447,7 @@ def sample_prioritised_batch(
     # How many rows come from where is not known when this is compiled, so each is read from both tables, and one reading thrown away.
     replayed = ~drawn.is_demonstration
     relabelled = replayed & (jnp.cumsum(replayed) <= _num_relabelled(jnp.sum(replayed), config))  # the first of them: all are drawn alike
-    from_replay = _replay_rows(key_goal, replay, drawn.rows, drawn.steps, relabelled, table, **read)
+    from_replay = _replay_rows(key_goal, replay, drawn.rows, drawn.steps, relabelled, table, retelling=retelling, **read)
     from_demonstrations = demonstration_rows(demonstrations, drawn.rows, drawn.steps, **read)
     batch = tree_where(replayed, from_replay, from_demonstrations)
     return batch.replace(weight=prioritised.importance_weights(drawn, config)), drawn

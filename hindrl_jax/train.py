@@ -23,7 +23,7 @@ from hindrl_jax.randomness import uniform_index
 from hindrl_jax.relabel import hindsight_steps
 from hindrl_jax.replay import ReplayState
 from hindrl_jax.rollout import Act, Evaluation, RolloutState, StartTable
-from hindrl_jax.types import Array, Environment, Episodes, TimeStep, Transition, action_to_env, tree_where
+from hindrl_jax.types import Array, Environment, Episodes, RetellableEnvironment, TimeStep, Transition, action_to_env, tree_where
 
 
 class Guidance(struct.PyTreeNode, kw_only=True):
@@ -95,6 +95,7 @@ def guidance(demonstrations: Episodes, env: Environment, config: TrainConfig) ->
             filtered=goal_config.epsilon_filtering,
             exclude_last=goal_config.exclude_last_goal,
             inclusive=inclusive,
+            observations=demonstrations.observations if isinstance(env, RetellableEnvironment) else None,
         ),
         behavioural_goals=behavioural_goals,
         epsilon=epsilon,
@@ -317,6 +318,7 @@ def improve(
         achieved_goal=env.achieved_goal,
         epsilon=data.epsilon,
         config=config.batch,
+        retelling=replay.Retelling(env.retell, env.num_subgoals) if isinstance(env, RetellableEnvironment) else None,
     )
     if config.batch.has_priorities:
         key_batch, key_errors = jax.random.split(key_batch)

@@ -128,6 +128,28 @@ class RestorableEnvironment(Environment, Protocol):
         """The state of a vector (S,), with this key."""
 
 
+@runtime_checkable
+class RetellableEnvironment(Environment, Protocol):
+    """An environment whose observations say what an episode is about, and whose motion does not depend on that: what has happened can be told
+    again as though the episode had been about something else. Hindsight then changes observations in place of goals."""
+
+    @property
+    def num_subgoals(self) -> int:
+        """J, how many states one story is about."""
+
+    def retell(self, key: Array, observations: Array, subgoals: Array) -> tuple[Array, Array]:
+        """What would have been seen, had the episode been about other states.
+
+        Args:
+          key: random key.
+          observations: (n + 1, D) of states that follow each other, the task not solved in the first.
+          subgoals: (J, D) observations of the states that it is now about, in the order in which they are to be reached.
+
+        Returns:
+          The observations anew, and (n,) bool for each but the first, whether the task is solved there.
+        """
+
+
 def action_to_env(action: Array, env: Environment) -> Array:
     """Maps policy actions (..., A) in [-1, 1] to the environment's own units."""
     low, high = _action_bounds(action, env)

@@ -209,6 +209,25 @@ def test_normalised_value_is_one_whatever_the_rewards_are():
     np.testing.assert_allclose(normalised["actor/value"], plain["actor/value"], rtol=1e-5)
 
 
+def test_relative_value_weighs_every_row_by_its_own_size(monkeypatch):
+    config = dataclasses.replace(CONFIG, relative_value=True)
+    given = np.where(np.arange(B) % 2, 0.5, 0.002)  # the second is below the least size, 0.01
+    monkeypatch.setattr(agents, "_value", lambda *_: jnp.asarray(given, jnp.float32))
+    start = fresh_agent(jax.random.key(0)).replace(log_alpha=jnp.asarray(-30.0))
+    _, metrics = agents._actor_gradient(start, SCHEDULE, config, columns())
+    np.testing.assert_allclose(metrics["actor/loss"], -0.5 * (1.0 + 0.2), atol=1e-5)
+    # Its gradient is that of the logarithm: d(v / |v|) = dv / v.
+    slope = jax.grad(lambda change: agents._climbed(jnp.array([0.5, 0.25]) + change, config))(0.0)
+    np.testing.assert_allclose(slope, 0.5 * (1 / 0.5 + 1 / 0.25), rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["normalise_value", "relative_value"])
+def test_targets_leave_entropy_out_where_its_weight_is_in_other_units(name):
+    state = fresh_agent(jax.random.key(0)).replace(log_alpha=jnp.asarray(0.0))
+    assert np.abs(agents._next_action(state, CONFIG, columns())[1]).min() > 0.0
+    assert not agents._next_action(state, dataclasses.replace(CONFIG, **{name: True}), columns())[1].any()
+
+
 def test_the_size_of_the_value_is_that_of_the_whole_batch(monkeypatch):
     # Blocks of a batch have sizes of their own; so the batch is not cut, however small the cache.
     monkeypatch.setattr(agents, "_BLOCK_BYTES", 100)

@@ -278,6 +278,57 @@ def check_rows(batch, hindsight, sources, strategy, config):
         assert batch.action[row, 0] == reward_of(env, episode, t)
 
 
+def tell(key, observations, subgoals):
+    """Writes the two states that the story is about, as decimal digits, into its observations; it is over at the step of the second."""
+    codes = 1000.0 + subgoals @ jnp.array([100.0, 10.0, 1.0])
+    told = observations.at[:, :2].add(10.0 * codes[None])
+    return told, observations[1:, 2] >= subgoals[1, 2]
+
+
+@functools.partial(jax.jit, static_argnames="config", compiler_options=FAST_COMPILATION)
+def draw_retold_batch(key, replay, config):
+    table = TABLE.replace(observations=TABLE.goals)
+    given = dict(achieved_goal=identity, epsilon=jnp.zeros(3), demo_rows=jnp.asarray(NUM_DEMO), config=config)
+    return sample_batch(key, replay, demonstrations(), table, retelling=replays.Retelling(tell, 2), **given)
+
+
+@pytest.mark.parametrize("strategy", ["final", "future", "episode", "random", "task_conditioned", "joint_union"])
+def test_a_retold_row_is_about_states_of_its_source_in_their_order(strategy):
+    history, story = replay_history([[3, 2], [1, 3]])
+    replay, sources = at(history, 17), kept(story[17])  # early: episodes have numbers of one digit
+    config = dataclasses.replace(BATCH, hindrl_sampling_strategy=strategy)
+    batch = jax.device_get(draw_retold_batch(jax.random.key(0), replay, config))
+    retold = np.flatnonzero(batch.is_relabelled)
+    assert retold.tolist() == list(range(NUM_DEMO, NUM_DEMO + NUM_RELABELLED))
+    assert (np.delete(batch.observation, retold, axis=0)[:, 0] <= 9).all()
+    for row in retold:
+        (*first, env), (*second, episode) = ([int(digit) for digit in str(int(value))[1:]] for value in batch.observation[row, :2])
+        first, second, t = tuple(first), tuple(second), int(batch.observation[row, 2])
+        length = sources[env, episode]
+        own = [(env, episode, step) for step in range(length + 1)]
+        if strategy in ("final", "future", "episode"):
+            assert first in own
+            assert second in own
+            assert first <= second
+            assert strategy != "future" or first[2] > t
+        if strategy == "task_conditioned":
+            assert {first, second} <= set(DEMO_STATES)
+        if strategy == "joint_union":
+            assert {first, second} <= set(DEMO_STATES) or (set(own) >= {first, second} and t < first[2] <= second[2])
+        # A plain loop over at most two steps, each of which may end the story.
+        expected_reward, expected_discount, following = 0.0, 1.0, t
+        for step in range(t, min(t + 2, length)):
+            solved = step + 1 >= second[2]
+            expected_reward, expected_discount, following = expected_reward + expected_discount * solved, expected_discount * 0.5, step + 1
+            if solved:
+                expected_discount = 0.0
+                break
+        assert (batch.reward[row], batch.discount[row], batch.next_observation[row, 2]) == (expected_reward, expected_discount, following)
+        assert batch.next_observation[row, 0] == batch.observation[row, 0]
+        assert batch.desired_goal[row, 0] == -1 - env  # the goal that the episode was acted under
+        assert batch.obtained_return[row] == 0.0
+
+
 @functools.partial(jax.jit, static_argnames="config", compiler_options=FAST_COMPILATION)
 def draw_prioritised_batch(key, replay, config):
     return sample_prioritised_batch(key, replay, demonstrations(), TABLE, achieved_goal=identity, epsilon=jnp.zeros(3), config=config)

@@ -9,8 +9,9 @@ Differences from the thesis:
   * A rotation counts as reached by its angle, not by the distance between two axis-angle vectors, for the same reason (`rotation_test`).
   * The joints vary at reset by 0.02 rad, as in the original code; in the text every episode starts from the same position (`joint_noise=0`).
   * Commanded rotations are about the base's axes, as in robosuite's controller; the text has them relative to the hand's orientation.
-  * The random task observes the waypoints, as the thesis says it must: for each, the displacement and the rotation that remain. Its achieved goal is
-    the displacement and rotation that remain to the last waypoint, and the mask, so that equal goals mean the same in every episode.
+  * The random task observes the waypoints, as the thesis says it must: for each, the displacement and the rotation that remain, the one whose turn
+    it is first. Its achieved goal is the displacement and rotation that remain to the last waypoint, and the mask, so that equal goals mean the same
+    in every episode. In hindsight not the goal is changed but the waypoints (`ParameterizedReach.retell`).
 """
 
 from __future__ import annotations
@@ -196,12 +197,7 @@ class _Reach(abc.ABC):
         state = state.replace(joints=joints, velocities=velocities, step=state.step + 1)
         arm = panda.posture(joints)
         position, rotation = self.next_waypoint(state)
-        if self.rotation_test == "angle":
-            turn = rotations.between(arm.hand_rotation, rotation)
-        else:
-            turn = rotations.to_rotation_vector(rotation) - rotations.to_rotation_vector(arm.hand_rotation)
-        distance, angle = (jnp.sqrt(jnp.sum(jnp.square(vector))) for vector in (position - arm.hand_position, turn))
-        reached = (distance < self.position_tolerance) & (angle < self.rotation_tolerance) & ~self.is_solved(state)
+        reached = self._is_within(arm.hand_position, arm.hand_rotation, position, rotation) & ~self.is_solved(state)
         state = state.replace(num_reached=state.num_reached + reached)
         terminated = self.is_solved(state)
         return state, TimeStep(
@@ -210,6 +206,15 @@ class _Reach(abc.ABC):
             terminated=terminated,
             truncated=(state.step >= self.horizon) & ~terminated,
         )
+
+    def _is_within(self, hand_position: Array, hand_rotation: Array, position: Array, rotation: Array) -> Array:
+        """() bool, whether a hand at (3,) and (3, 3) has reached a waypoint at (3,) and (3, 3)."""
+        if self.rotation_test == "angle":
+            turn = rotations.between(hand_rotation, rotation)
+        else:
+            turn = rotations.to_rotation_vector(rotation) - rotations.to_rotation_vector(hand_rotation)
+        distance, angle = (jnp.sqrt(jnp.sum(jnp.square(vector))) for vector in (position - hand_position, turn))
+        return (distance < self.position_tolerance) & (angle < self.rotation_tolerance)
 
     def next_waypoint(self, state: ReachState) -> tuple[Array, Array]:
         """Position (3,) and rotation matrix (3, 3) of the waypoint whose turn it is, or of the last one if all are reached."""
@@ -320,7 +325,8 @@ class ParameterizedReach(_Reach):
     """The waypoints are drawn anew in every episode, and observed (thesis 3.2.1).
 
     Observation: the hand's position (3), its orientation (6), a mask of the waypoints reached (K), and for each waypoint the displacement (3, in m)
-    and the rotation vector (3, in rad) from the hand to it. Achieved goal: the last waypoint's displacement and rotation vector, and the mask.
+    and the rotation vector (3, in rad) from the hand to it: first the waypoint whose turn it is, then those after it, then those reached. Achieved
+    goal: the last waypoint's displacement and rotation vector, and the mask.
     """
 
     name: ClassVar[str] = "ParameterizedReach"
@@ -335,16 +341,77 @@ class ParameterizedReach(_Reach):
 
     def achieved_goal(self, observation: Array) -> Array:
         """(..., D) -> (..., 6 + K): what remains to the last waypoint, and the mask."""
-        mask = observation[..., self.pose_dim : self.pose_dim + self.num_waypoints]
-        return jnp.concatenate([observation[..., -6:], mask], axis=-1)
+        _, mask, remaining = self._parts(observation)
+        place = jnp.mod(self.num_waypoints - 1 - jnp.sum(mask, axis=-1).astype(jnp.int32), self.num_waypoints)
+        last = jnp.take_along_axis(remaining, place[..., None, None], axis=-2)[..., 0, :]
+        return jnp.concatenate([last, mask], axis=-1)
 
     def task_goal(self) -> Array:
         """(6 + K,) nothing remains, and all is reached."""
         return jnp.concatenate([jnp.zeros(6), jnp.ones(self.num_waypoints)])
 
+    @property
+    def num_subgoals(self) -> int:
+        """One for each waypoint."""
+        return self.num_waypoints
+
+    def retell(self, key: Array, observations: Array, subgoals: Array) -> tuple[Array, Array]:
+        """The same motion of the arm, told as though the waypoints had been where the hand was in other states.
+
+        The waypoints do not move the arm, so this is just what would have been observed. How many of them had been reached when the story begins is
+        either as it was or drawn anew, with equal chances: else nothing would be told about the later ones before the first has been found.
+
+        Args:
+          key: random key.
+          observations: (n + 1, D) of states that follow each other, the task not solved in the first.
+          subgoals: (K, D) observations of the states whose poses become the waypoints that remain, in their order; more than remain are left out.
+
+        Returns:
+          The observations anew, and (n,) bool for each but the first, whether the task is solved there.
+        """
+        key_lived, key_count = jax.random.split(key)
+        poses, masks, remaining = self._parts(observations)
+        positions, matrices = jax.vmap(self._from_pose)(poses)
+        lived = jnp.sum(masks[0]).astype(jnp.int32)
+        drawn = jax.random.randint(key_count, (), 0, self.num_waypoints)
+        count = jnp.where(jax.random.bernoulli(key_lived), lived, drawn)
+
+        displacements, turns = jnp.split(jnp.roll(remaining[0], lived, axis=0), 2, axis=-1)
+        old_positions = positions[:1] + displacements
+        old_matrices = jnp.sum(jax.vmap(rotations.from_rotation_vector)(turns)[:, :, :, None] * matrices[0][None, None], axis=2)
+        new_positions, new_matrices = jax.vmap(self._from_pose)(self._parts(jnp.roll(subgoals, count, axis=0))[0])
+        remains = jnp.arange(self.num_waypoints) >= count
+        waypoints = jnp.where(remains[:, None], new_positions, old_positions), jnp.where(remains[:, None, None], new_matrices, old_matrices)
+
+        remaining = jax.vmap(_remaining, (0, 0, None, None))(positions, matrices, *waypoints)  # (n + 1, K, 6)
+        within = jax.vmap(jax.vmap(self._is_within, (None, None, 0, 0)), (0, 0, None, None))(positions, matrices, *waypoints)  # (n + 1, K)
+
+        def arrive(count: Array, within: Array) -> tuple[Array, Array]:
+            count = count + jnp.any(within & (jnp.arange(self.num_waypoints) == count))
+            return count, count
+
+        _, counts = jax.lax.scan(arrive, count, within[1:])
+        counts = jnp.concatenate([count[None], counts])
+        return jax.vmap(self._joined)(poses, counts, remaining), counts[1:] >= self.num_waypoints
+
+    def _parts(self, observation: Array) -> tuple[Array, Array, Array]:
+        """(..., D) -> the pose (..., P), the mask (..., K), and what remains to each waypoint (..., K, 6) as it is ordered there."""
+        pose, mask, remaining = jnp.split(observation, [self.pose_dim, self.pose_dim + self.num_waypoints], axis=-1)
+        return pose, mask, remaining.reshape((*remaining.shape[:-1], self.num_waypoints, 6))
+
+    def _joined(self, pose: Array, num_reached: Array, remaining: Array) -> Array:
+        """The observation of a pose (P,), a number of waypoints reached (), and what remains to each waypoint (K, 6), from first to last."""
+        mask = (jnp.arange(self.num_waypoints) < num_reached).astype(jnp.float32)
+        return jnp.concatenate([pose, mask, jnp.roll(remaining, -num_reached, axis=0).reshape(-1)])
+
+    def _from_pose(self, pose: Array) -> tuple[Array, Array]:
+        """The inverse of `_pose`: (P,) -> a position (3,) and a rotation matrix (3, 3)."""
+        orientation = rotations.from_six_d if self.orientation == "six_d" else rotations.from_rotation_vector
+        return pose[:3], orientation(pose[3:])
+
     def _observe(self, state: ReachState, arm: panda.Posture) -> Array:
-        remaining = [state.positions - arm.hand_position[None], jax.vmap(rotations.between, (None, 0))(arm.hand_rotation, state.rotations)]
-        return jnp.concatenate([self._pose(arm.hand_position, arm.hand_rotation), self._mask(state), jnp.concatenate(remaining, axis=1).reshape(-1)])
+        remaining = _remaining(arm.hand_position, arm.hand_rotation, state.positions, state.rotations)
+        return self._joined(self._pose(arm.hand_position, arm.hand_rotation), state.num_reached, remaining)
 
     def _observation_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         low, high = super()._observation_bounds()
@@ -355,6 +422,12 @@ class ParameterizedReach(_Reach):
 
     def _waypoints(self, key: Array) -> tuple[Array, Array]:
         return random_waypoints(key, self.num_waypoints)
+
+
+def _remaining(hand_position: Array, hand_rotation: Array, positions: Array, matrices: Array) -> Array:
+    """(K, 6) displacement in m and rotation vector in rad from the hand to each of K poses."""
+    turns = jax.vmap(rotations.between, (None, 0))(hand_rotation, matrices)
+    return jnp.concatenate([positions - hand_position[None], turns], axis=1)
 
 
 def random_waypoints(key: Array, count: int) -> tuple[Array, Array]:

@@ -43,6 +43,12 @@ def to_six_d(matrix: Array) -> Array:
     return jnp.concatenate([matrix[:, 0], matrix[:, 1]])
 
 
+def from_six_d(columns: Array) -> Array:
+    """The inverse of `to_six_d`: the first two columns (6,) of a rotation matrix -> the matrix (3, 3)."""
+    first, second = columns[:3], columns[3:]
+    return jnp.stack([first, second, jnp.cross(first, second)], axis=1)
+
+
 def between(source: Array, target: Array) -> Array:
     """The rotation vector (3,) that turns matrix `source` into `target`, in the axes that both are given in."""
     return to_rotation_vector(jnp.sum(target[:, None, :] * source[None, :, :], axis=2))

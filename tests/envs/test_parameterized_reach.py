@@ -335,6 +335,44 @@ def test_goals_of_many_observations_at_once():
         np.testing.assert_array_equal(goals[1, 2], env.achieved_goal(observations[1, 2]))
 
 
+# --- hindsight
+
+
+@pytest.mark.parametrize("arguments", [{}, {"num_waypoints": 3}, {"orientation": "axis_angle", "rotation_test": "axis_angle"}])
+def test_a_story_told_anew_is_what_would_have_been_observed(arguments):
+    env = ParameterizedReach(**arguments)
+    count, num_steps, starts = env.num_waypoints, 4, (0, 5, 11)
+    joints = np.array(panda.INITIAL_JOINTS) + np.cumsum(np.random.default_rng(0).normal(0.004, 0.006, (30, 7)), axis=0)
+    state = place(
+        np.linspace((0.1, 0.0, 0.1), (-0.1, 0.2, 0.0), count), np.linspace((0.3, 0, 0), (0, 0, 0.2), count), joints=joints[0], num_reached=1
+    )
+    look = compiled(jax.vmap(lambda q: env.observe(state.replace(joints=q))))
+    observations = look(jnp.asarray(joints, jnp.float32))
+    retell, arrive = compiled(env.retell), compiled(env.arrive)
+    told_counts, solved_at_all = set(), []
+    for seed in range(12):
+        start = starts[seed % 3]
+        chosen = [start + 2, start + 3, start + 3 + seed][:count] if count == 3 else [start + 1 + seed % 3, start + 3]
+        told, solved = retell(jax.random.key(seed), observations[start : start + num_steps + 1], observations[np.array(chosen)])
+        mask = told[0, env.pose_dim : env.pose_dim + count]
+        reached = int(mask.sum())
+        poses = [mujoco_hand(joints[index]) for index in chosen[: count - reached]]
+        lived = state.replace(joints=jnp.asarray(joints[start], jnp.float32), num_reached=jnp.asarray(reached))
+        lived = lived.replace(
+            positions=lived.positions.at[reached:].set(jnp.array([position for position, _ in poses])),
+            rotations=lived.rotations.at[reached:].set(jnp.array([matrix for _, matrix in poses])),
+        )
+        np.testing.assert_allclose(told[0], observe(env, lived), atol=2e-5)
+        for index in range(1, num_steps + 1):
+            lived, time_step = arrive(lived, jnp.asarray(joints[start + index], jnp.float32), lived.velocities)
+            np.testing.assert_allclose(told[index], time_step.observation, atol=2e-5)
+            assert solved[index - 1] == env.is_solved(lived)
+        told_counts.add(reached)
+        solved_at_all.append(bool(solved[-1]))
+    assert told_counts == set(range(count))
+    assert sum(solved_at_all) > 0
+
+
 # --- observations
 
 
@@ -346,7 +384,7 @@ def test_observation_is_what_mujoco_says(orientation):
     position, matrix = mujoco_hand(joints)
     pose = matrix[:, :2].T.reshape(-1) if orientation == "six_d" else Rotation.from_matrix(matrix).as_rotvec()
     hand_and_mask = np.concatenate([position, pose, [1.0, 0.0]])
-    remaining = np.concatenate([offsets, turns], axis=1).reshape(-1)  # waypoint by waypoint, whether reached or not
+    remaining = np.concatenate([offsets, turns], axis=1)[::-1].reshape(-1)  # the second, whose turn it is, then the first, which has been reached
     found = observe(FixedParameterizedReach(orientation=orientation), state)
     np.testing.assert_allclose(found, hand_and_mask, atol=1e-5)
     found = observe(ParameterizedReach(orientation=orientation), state)
