@@ -13,6 +13,9 @@ The strategy joint_union takes task_conditioned with probability `union_sampling
 weights. A row whose intersection is empty is not relabelled. What lies within epsilon of what is noted while an episode is lived
 (`goals.nearby_goal`), which makes the intersection, "exceptionally slow" in the thesis, nearly as cheap as the others. Differences from HinDRL in the
 form that takes demonstrated goals: one goal near each state is noted for good, so a goal is drawn by the states that it lies near.
+
+Where observations hold what an episode is about (`types.RetellableEnvironment`), states from the same sources take the place of that, and no goal is
+changed; intersections, which compare goals, have no meaning there.
 """
 
 from __future__ import annotations
