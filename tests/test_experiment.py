@@ -187,9 +187,10 @@ def test_a_film_that_cannot_be_drawn_is_a_warning(saved, tmp_path, monkeypatch):
     assert hindrl.load_run(tmp_path).spec.seeds == (0,)
 
 
-def test_the_reach_recipe_runs_from_demonstration_to_evaluation(tmp_path, monkeypatch):
+@pytest.mark.parametrize("task", ["FixedParameterizedReach", "ParameterizedReach"])
+def test_the_reach_recipe_runs_from_demonstration_to_evaluation(task, tmp_path, monkeypatch):
     """With every lever of the recipe, in a task so coarse and networks so small that it takes seconds."""
-    env = hindrl.make("FixedParameterizedReach", num_waypoints=1, position_tolerance=0.1, rotation_tolerance=0.3, horizon=100)
+    env = hindrl.make(task, num_waypoints=1, position_tolerance=0.1, rotation_tolerance=0.3, horizon=100)
     recipe = hindrl.preset("hindrl", env=env)
     config = dataclasses.replace(
         recipe,
@@ -212,6 +213,14 @@ def test_the_reach_recipe_runs_from_demonstration_to_evaluation(tmp_path, monkey
     (outcome,) = hindrl.load_run(tmp_path).evaluate(episodes=3)
     assert outcome["seed"] == 0
     assert 1 <= outcome["episode_length"] <= 100
+
+
+def test_goals_cannot_be_compared_where_hindsight_changes_none():
+    env = hindrl.make("ParameterizedReach", num_waypoints=1)
+    config = hindrl.preset("hindrl", env=env)
+    batch = dataclasses.replace(config.batch, hindrl_sampling_strategy="joint_intersection")
+    with pytest.raises(hindrl.UserError, match="joint_intersection compares goals"):
+        hindrl.fit(env, hindrl.record_demonstrations(env, 1), dataclasses.replace(config, batch=batch), seeds=[0])
 
 
 def test_damaged_parameters_are_refused(saved, tmp_path):

@@ -1,5 +1,7 @@
 """Learning from beginning to end. Minutes each: `make test-slow`."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -27,6 +29,16 @@ def test_one_demonstration_solves_the_fixed_reach_task():
     assert all(summary.best_success >= 0.95 for summary in result.summaries())
     assert (result.final_success >= 0.5).all(), result.final_success  # a policy that has learned dips now and then, and recovers
     assert (result.final_length <= 220).all(), result.final_length  # the best possible is about 165, the demonstrations' 290
+
+
+def test_hindsight_that_moves_the_waypoints_solves_the_random_reach_task():
+    env = hindrl.make("ParameterizedReach")
+    config = dataclasses.replace(hindrl.preset("hindrl", env=env), steps=40_000)
+    result = hindrl.fit(env, hindrl.record_demonstrations(env, 100, seed=7001), config, seeds=[7001])
+    (summary,) = result.summaries()
+    assert summary.best_success >= 0.9
+    assert result.final_success[0] >= 0.85  # cloning alone: 0.25
+    assert result.final_length[0] <= 190  # the demonstrations' 255
 
 
 def test_cloning_needs_many_demonstrations():

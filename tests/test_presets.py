@@ -107,10 +107,12 @@ def test_original_preset_differs_from_the_thesis_by_the_quirks_alone(env, more):
 def test_default_recipes_differ_by_family_and_the_grid_has_the_defaults_of_the_config():
     second_life = dataclasses.replace(TrainConfig(), steps=240_000, agent_resets=(1 / 3,))
     assert preset("hindrl", env="GridPickAndPlace") == preset("hindrl") == second_life
-    reach = preset("hindrl", env="ParameterizedReach")
-    assert preset("hindrl", env=make("ParameterizedReach", num_waypoints=1)) == reach
-    assert reach == preset("hindrl", env="FixedParameterizedReach") != TrainConfig()
-    assert reach.demo_reset_ratio > 0.0
+    fixed, retold = preset("hindrl", env="FixedParameterizedReach"), preset("hindrl", env="ParameterizedReach")
+    assert preset("hindrl", env=make("ParameterizedReach", num_waypoints=1)) == retold
+    assert TrainConfig() != fixed != retold  # what has happened is told anew there, in part about demonstrated states
+    assert retold.batch.hindrl_sampling_strategy == "joint_union"
+    assert preset("bc", env="ParameterizedReach") == preset("bc", env="FixedParameterizedReach")
+    assert retold.demo_reset_ratio > 0.0
     assert preset("tqcfd", env="ParameterizedReach").batch.num_sampled_goals == 0.0
 
 
