@@ -1,8 +1,8 @@
 """TQC with hindsight experience replay, as Stable-Baselines3 has it, on our environments as Gymnasium registers them.
 
-python examples/sb3_her_tqc.py                                                  # one object on a 4 x 4 grid
-python examples/sb3_her_tqc.py --learner sbx                                    # the same with SBX
-python examples/sb3_her_tqc.py --num-objects 2 --size 10 --steps 200000         # the default task
+python examples/sb3_her_tqc.py                     # a Panda arm and one waypoint, 5 cm wide
+python examples/sb3_her_tqc.py --learner sbx       # the same with SBX
+python examples/sb3_her_tqc.py --env hindrl/FixedGridPickAndPlace-v0 --set num_objects=1 size=4     # any environment, with any arguments
 
 Nothing here is ours but the environment. It needs `pip install sb3-contrib` or sbx-rl; or, where `make bench` has installed them, it is run by
 `PYTHONPATH=. benchmarks/.venv/bin/python`.
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import json
 import time
 
 import gymnasium
@@ -54,7 +55,7 @@ class Evaluate(BaseCallback):
 
 def train(arguments: argparse.Namespace) -> list[float]:
     """Trains, and returns the success rates along the run."""
-    task = dict(num_objects=arguments.num_objects, size=arguments.size)
+    task = {name: json.loads(value) for name, _, value in (given.partition("=") for given in arguments.set)}
     envs, fresh = (
         make_vec_env(arguments.env, n_envs=arguments.num_envs, seed=seed, env_kwargs=task) for seed in (arguments.seed, arguments.seed + 10_000)
     )
@@ -82,10 +83,9 @@ def train(arguments: argparse.Namespace) -> list[float]:
 
 def parse(given: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env", default="hindrl/FixedGridPickAndPlace-v0")
+    parser.add_argument("--env", default="hindrl/FixedParameterizedReach-v0")
+    parser.add_argument("--set", nargs="*", default=["num_waypoints=1", "position_tolerance=0.05", "rotation_tolerance=0.3"], metavar="NAME=VALUE")
     parser.add_argument("--learner", choices=["sb3", "sbx"], default="sb3")
-    parser.add_argument("--num-objects", type=int, default=1)
-    parser.add_argument("--size", type=int, default=4)
     parser.add_argument("--steps", type=int, default=20_000, help="environment steps")
     parser.add_argument("--num-envs", type=int, default=8)
     parser.add_argument("--gradient-steps", type=int, default=4, help="after each step of all environments")
