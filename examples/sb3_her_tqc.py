@@ -1,8 +1,8 @@
 """TQC with hindsight experience replay, as Stable-Baselines3 has it, on our environments as Gymnasium registers them.
 
-python examples/sb3_her_tqc.py                     # a Panda arm and one waypoint, 5 cm wide
+python examples/sb3_her_tqc.py                     # one object on a 4 x 4 grid
 python examples/sb3_her_tqc.py --learner sbx       # the same with SBX
-python examples/sb3_her_tqc.py --env hindrl/FixedGridPickAndPlace-v0 --set num_objects=1 size=4     # any environment, with any arguments
+python examples/sb3_her_tqc.py --env hindrl/FixedParameterizedReach-v0 --set num_waypoints=1 position_tolerance=0.1     # any task, any arguments
 
 Nothing here is ours but the environment. It needs `pip install sb3-contrib` or sbx-rl; or, where `make bench` has installed them, it is run by
 `PYTHONPATH=. benchmarks/.venv/bin/python`.
@@ -83,8 +83,8 @@ def train(arguments: argparse.Namespace) -> list[float]:
 
 def parse(given: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env", default="hindrl/FixedParameterizedReach-v0")
-    parser.add_argument("--set", nargs="*", default=["num_waypoints=1", "position_tolerance=0.05", "rotation_tolerance=0.3"], metavar="NAME=VALUE")
+    parser.add_argument("--env", default="hindrl/FixedGridPickAndPlace-v0")
+    parser.add_argument("--set", nargs="*", default=["num_objects=1", "size=4"], metavar="NAME=VALUE")
     parser.add_argument("--learner", choices=["sb3", "sbx"], default="sb3")
     parser.add_argument("--steps", type=int, default=20_000, help="environment steps")
     parser.add_argument("--num-envs", type=int, default=8)
