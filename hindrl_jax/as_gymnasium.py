@@ -16,6 +16,7 @@ for one), all float32 within bounds.
 from __future__ import annotations
 
 import functools
+import numbers
 from collections.abc import Sequence
 from typing import Any
 
@@ -237,6 +238,7 @@ class GoalVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
           seed: environment i gets seed + i, or item i of a sequence; without, each goes on to the next episode of the seed that it has.
           options: see above.
         """
+        seed = int(seed) if isinstance(seed, numbers.Integral) else seed
         super().reset(seed=seed if isinstance(seed, int) else None)
         of_each = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else [None] * self.num_envs if seed is None else list(seed)
         if len(of_each) != self.num_envs:
@@ -251,7 +253,12 @@ class GoalVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         return self._task.unpack(self._lives.rows)[0], self._info(np.zeros(self.num_envs, bool), chosen)
 
     def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Takes one step of all: actions (E, A), clipped to [-1, 1]."""
+        """Takes one step of all: actions (E, A), clipped to [-1, 1].
+
+        Raises:
+          gymnasium.error.ResetNeeded: before the first `reset`.
+        """
+        self._check_reset()
         self._lives, rows = self._step(self._lives, np.asarray(actions, np.float32))
         observation, reward, terminated, truncated = self._task.unpack(self._lives.rows)
         ended = terminated | truncated
@@ -272,8 +279,12 @@ class GoalVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         """A picture (H, W, 3) uint8 of each environment; None without a render mode."""
         if self.render_mode is None:
             return None
-        states = jax.device_get(self._lives.states.replace(key=None))
-        return tuple(self._task.picture(jax.tree.map(lambda leaf, i=i: leaf[i], states)) for i in range(self.num_envs))
+        self._check_reset()
+        return tuple(self._task.picture(jax.tree.map(lambda leaf, i=i: leaf[i], self._lives.states)) for i in range(self.num_envs))
+
+    def _check_reset(self) -> None:
+        if self._lives is None:
+            raise gymnasium.error.ResetNeeded("no episode has begun: call reset first")
 
     def _info(self, is_success: np.ndarray, present: np.ndarray | None = None) -> dict[str, np.ndarray]:
         return {"is_success": is_success, "_is_success": np.ones(self.num_envs, bool) if present is None else present}

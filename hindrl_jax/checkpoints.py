@@ -17,7 +17,6 @@ import logging
 import os
 import shutil
 import time
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hindrl_jax.datasets import write_atomically
+from hindrl_jax.datasets import DAMAGED_ARCHIVE, read_arrays, write_atomically
 from hindrl_jax.errors import UserError, one_line
 from hindrl_jax.experiment import Result, Row
 from hindrl_jax.types import Episodes
@@ -152,10 +151,10 @@ class Checkpoints:
         """
         path = self.folder / DEMONSTRATIONS
         try:
-            with np.load(path, allow_pickle=False) as archive:
-                fields = {field.name: archive[field.name] for field in dataclasses.fields(Episodes) if field.name in archive}
-                stacked = Episodes(**fields)
-        except (OSError, ValueError, EOFError, TypeError, zipfile.BadZipFile) as error:
+            known = {field.name for field in dataclasses.fields(Episodes)}
+            fields: dict[str, Any] = {name: array for name, array in read_arrays(path).items() if name in known}
+            stacked = Episodes(**fields)
+        except DAMAGED_ARCHIVE as error:
             raise UserError(f"{path} is damaged ({one_line(error)}): train again") from error
         return [stacked.replace(**{name: leaf[i] for name, leaf in fields.items()}) for i in range(len(stacked.lengths))]
 

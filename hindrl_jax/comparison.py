@@ -156,10 +156,10 @@ def _csv_row(one: Comparison) -> dict[str, Any]:
         "updates": run.updates[-1],
         "seconds": f"{run.seconds[-1]:.6g}",
         "seeds_reaching_95": one.seeds_reaching_95,
-        "median_updates_to_95" if run.cloning else "median_env_steps_to_95": f"{one.steps_to_95:.6g}",
+        "median_env_steps_to_95": "" if run.cloning else f"{one.steps_to_95:.6g}",
+        "median_updates_to_95": f"{one.steps_to_95:.6g}" if run.cloning else "",
+        "median_seconds_to_95": f"{one.seconds_to_95:.6g}",
     }
-    row = {name: row.get(name, "") for name in (*list(row)[:11], "median_env_steps_to_95", "median_updates_to_95")}
-    row["median_seconds_to_95"] = f"{one.seconds_to_95:.6g}"
     for name, interval in (("final_success", one.final_success), ("difference", one.difference)):
         for suffix, field in (("", "estimate"), ("_low", "low"), ("_high", "high")):
             row[name + suffix] = "" if interval is None else f"{getattr(interval, field):.6g}"

@@ -34,7 +34,10 @@ import io
 import json
 import os
 import re
+import tokenize
 import warnings
+import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -281,6 +284,23 @@ def write_atomically(path: Path, content: bytes | memoryview, *, overwrite: bool
             temporary.unlink()
 
 
+DAMAGED_ARCHIVE = (
+    *(OSError, ValueError, EOFError, KeyError, TypeError, RuntimeError, SyntaxError, MemoryError),
+    *(zipfile.BadZipFile, zlib.error, tokenize.TokenError),
+)
+"""What NumPy raises for archives that are damaged, or are none."""
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """All arrays of an archive of NumPy's; nothing is unpickled.
+
+    Raises:
+      one of `DAMAGED_ARCHIVE`.
+    """
+    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+        return {name: archive[name] for name in archive.files}
+
+
 def check_can_write(path: Path, *, overwrite: bool) -> None:
     """Makes sure, before any work is done, that demonstrations can be saved under this name.
 
@@ -290,7 +310,7 @@ def check_can_write(path: Path, *, overwrite: bool) -> None:
     if path.is_dir():
         raise UserError(f"{path}: is a folder; name a file")
     if path.exists() and not overwrite:
-        raise UserError(f"{path}: exists already; allow overwriting it or choose another name")
+        raise UserError(f"{path}: exists already; replace it with --overwrite (overwrite=True), or choose another name")
     reason = why_unwritable(path.absolute().parent)
     if reason:
         raise UserError(f"{path}: cannot be written, since {reason}; choose another place")

@@ -164,6 +164,10 @@ def make(name: str, arguments: dict[str, Any]) -> GymnasiumEnv:
     return environment_class(name)(**own | {"make_kwargs": (*own.get("make_kwargs", ()), *others)})
 
 
+_PYTHONS = {"True": True, "False": False, "None": None}
+"""Values that are meant as Python writes them; JSON would take them for texts."""
+
+
 def _arguments(make_kwargs: tuple[str, ...]) -> dict[str, Any]:
     arguments = {}
     for given in make_kwargs:
@@ -171,7 +175,7 @@ def _arguments(make_kwargs: tuple[str, ...]) -> dict[str, Any]:
         if not (equals and name.isidentifier()):
             raise UserError(f"make_kwargs: {given!r} is not an argument and its value: write NAME=VALUE")
         try:
-            arguments[name] = json.loads(value)
+            arguments[name] = _PYTHONS[value] if value in _PYTHONS else json.loads(value)
         except ValueError:
             arguments[name] = value
     return arguments

@@ -7,6 +7,7 @@ hardly use it, since only complete episodes are learned from.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
@@ -342,21 +343,21 @@ def record_gymnasium(env: GymnasiumEnv, policy: Policy, num_demos: int, *, seed:
     rng = np.random.default_rng(seed)
     simulators = Simulators(dataclasses.replace(env, vectorization="sync"), 1)
     kept: list[Episodes] = []
-    simulators.begin(rng.integers(2**32, size=1))
-    for _ in range(max_attempts):
-        observations, goal = simulators.now()
-        observations, actions, ended = [observations], [], False
-        while not ended:
-            action = np.asarray(policy(simulators.told(), rng), np.float32)
-            actions.append(np.clip(action, env.action_low, env.action_high))
-            outcome = simulators.step(action[None])
-            observations.append(outcome.next_observation)
-            ended = outcome.ended[0]
-        if outcome.success[0]:
-            kept.append(_demonstration(env, np.concatenate(observations), np.stack(actions), goal[0]))
-        if len(kept) == num_demos:
-            simulators.close()
-            return jax.tree.map(lambda *leaves: np.stack(leaves), *kept)
+    with contextlib.closing(simulators):
+        simulators.begin(rng.integers(2**32, size=1))
+        for _ in range(max_attempts):
+            observations, goal = simulators.now()
+            observations, actions, ended = [observations], [], False
+            while not ended:
+                action = np.asarray(policy(simulators.told(), rng), np.float32)
+                actions.append(np.clip(action, env.action_low, env.action_high))
+                outcome = simulators.step(action[None])
+                observations.append(outcome.next_observation)
+                ended = outcome.ended[0]
+            if outcome.success[0]:
+                kept.append(_demonstration(env, np.concatenate(observations), np.stack(actions), goal[0]))
+            if len(kept) == num_demos:
+                return jax.tree.map(lambda *leaves: np.stack(leaves), *kept)
     raise UserError(
         f"the policy reached its goal in only {len(kept)} of {max_attempts} episodes of {env.name}, but {num_demos} demonstrations are wanted: "
         "ask for fewer, or give a better one"

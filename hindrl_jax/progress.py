@@ -31,7 +31,7 @@ class ProgressBar:
           console: where to write; standard output by default.
         """
         self._lines = lines
-        self._console = console or Console(highlight=False, soft_wrap=True)
+        self._console = console or Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
         self._live = self._console.is_terminal and not self._console.is_dumb_terminal and not self._console.legacy_windows
         self._drawn = False  # whether the cursor stands behind a bar
         self._handle: Any = None  # the bar of a notebook
@@ -66,7 +66,7 @@ class ProgressBar:
         if self._console.is_jupyter:
             print(line)
         else:
-            self._console.print(line, markup=False)
+            self._console.print(line)
 
     def close(self) -> None:
         """Takes the bar away; the lines stay."""

@@ -291,6 +291,8 @@ def _new_subgoals(key: Array, replay: ReplayState, rows: Array, steps: Array, ta
     lengths, shape = replay.episodes.lengths, (rows.shape[0], num_subgoals)
 
     def states_from(key: Array, source: Source) -> Array:
+        if source == "joint_intersection":
+            raise ValueError("joint_intersection compares goals, and a retelling changes none")
         key_row, key_step = jax.random.split(key)
         if source == "task_conditioned":
             return table.observations[uniform_index(key_row, shape, table.count)]

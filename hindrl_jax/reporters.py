@@ -42,6 +42,7 @@ class Reporter(abc.ABC):
           UserError: if something that it needs is missing.
         """
         self.directory = Path(directory)
+        self._seeds: Sequence[int] = ()
         self._num_seeds = 0
         self._reported = 0
 
@@ -49,6 +50,9 @@ class Reporter(abc.ABC):
         """For `fit(..., report=...)`."""
         from hindrl_jax.runs import FROM_PYTHON, RunSpec
 
+        if self._num_seeds and (self._seeds != result.seeds or len(result.rows) < self._reported):
+            self._close()  # of a run that was interrupted
+            self._num_seeds = 0
         if not self._num_seeds:
             if len(set(result.configs)) > 1:
                 raise UserError("a reporter shows runs of one config: train the others apart, or use `hindrl sweep`")
@@ -63,7 +67,7 @@ class Reporter(abc.ABC):
         Raises:
           UserError: if it cannot.
         """
-        self._num_seeds, self._reported = len(spec.seeds), 0
+        self._seeds, self._num_seeds, self._reported = spec.seeds, len(spec.seeds), 0
         self._open(spec)
 
     def report(self, rows: Sequence[Row]) -> None:

@@ -22,7 +22,6 @@ import resource
 import shutil
 import sys
 import warnings
-import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args, get_type_hints
@@ -38,7 +37,7 @@ from hindrl_jax import host, plots, rollout
 from hindrl_jax import train as training
 from hindrl_jax.agent import InputScale
 from hindrl_jax.config import TrainConfig, with_values
-from hindrl_jax.datasets import why_unwritable
+from hindrl_jax.datasets import DAMAGED_ARCHIVE, read_arrays, why_unwritable
 from hindrl_jax.devices import seed_mesh
 from hindrl_jax.errors import UserError, one_line
 from hindrl_jax.experiment import Result, Row
@@ -619,12 +618,11 @@ def load_run(path: str | os.PathLike[str]) -> Run:
     if not file.exists():
         raise UserError(f"{path} holds no {PARAMETERS}: the run did not finish; go on with it by `hindrl train --resume {path}`")
     try:
-        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            tree = unflatten_dict({name: jnp.asarray(archive[name]) for name in archive.files}, sep="/")
+        tree = unflatten_dict({name: jnp.asarray(array) for name, array in read_arrays(file).items()}, sep="/")
         goals = GoalTable(goals=tree["behavioural_goals"]["goals"], count=tree["behavioural_goals"]["count"])
         scale = _input_scale(tree["input_scale"])
         policies = tree["policy"]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except DAMAGED_ARCHIVE as error:
         raise UserError(f"{file} is damaged ({one_line(error)}): train again") from error
     return Run(path=path, spec=spec, policies=policies, behavioural_goals=goals, scale=scale)
 

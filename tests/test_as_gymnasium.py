@@ -179,3 +179,13 @@ def test_seeds_must_be_as_many_as_environments():
 def test_the_environment_is_the_one_that_python_makes():
     env = gymnasium.make(GRID, num_objects=3).unwrapped
     assert env._task.env == hindrl.make("FixedGridPickAndPlace", num_objects=3, horizon=2**31 - 1)
+
+
+def test_a_vector_environment_asks_for_its_reset_and_takes_any_whole_number_as_seed():
+    envs = gymnasium.make_vec(gymnasium_id("FixedGridPickAndPlace"), num_envs=2, render_mode="rgb_array")
+    for ask in (envs.render, lambda: envs.step(np.zeros((2, 3), np.float32))):
+        with pytest.raises(gymnasium.error.ResetNeeded, match="call reset first"):
+            ask()
+    first, second = (envs.reset(seed=seed)[0]["observation"] for seed in (3, np.int64(3)))
+    np.testing.assert_array_equal(first, second)
+    assert len(envs.render()) == 2

@@ -337,6 +337,7 @@ def test_envs_lists_every_environment(capsys):
     cli.main(["envs"])
     printed = capsys.readouterr().out
     assert all(name in printed for name in TASKS)
+    assert "\ngymnasium:ID: " in printed  # rich would make a picture of :ID:
 
 
 def test_every_config_field_is_a_flag(capsys):

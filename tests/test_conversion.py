@@ -236,13 +236,50 @@ def test_options_that_mend_a_file(low_dim):
         assert demo.extras["source/rewards"].tolist() == [0.0] * 41
 
 
+def test_what_a_reward_means_is_settled_by_the_whole_file(tmp_path):
+    """In a file of rewards 0 and 1, a demonstration without any has failed; in one of -1 and 0, a 0 is the success."""
+    for rewards, expected in (([[0, 0, 1], [0, 0, 0]], [True, False]), ([[-1, -1, 0], [-1, -1, -1]], [True, False]), ([[0, 0, 0]], [False])):
+        path = tmp_path / f"{len(rewards)}{rewards[0][0]}.npz"
+        given = dict(lengths=[3] * len(rewards), observations=np.zeros((4 * len(rewards), 1)), achieved_goals=np.zeros((4 * len(rewards), 1)))
+        np.savez(path, actions=np.zeros((3 * len(rewards), 1)), rewards=np.concatenate(rewards).astype(float), **given)
+        recording = read(str(path), Interpretation(solved="reward"))
+        assert [demo.terminated for demo in recording.demonstrations] == expected
+
+
+@pytest.mark.parametrize("about", [{"names": ["a"]}, {"names": ["a", "a"]}, {"names": "ab"}, {"env_kwargs": [1]}, {"env_name": 3}])
+def test_what_an_archive_says_about_itself_is_checked(tmp_path, about):
+    given = dict(lengths=[1, 1], observations=np.zeros((4, 1)), achieved_goals=np.zeros((4, 1)), actions=np.zeros((2, 1)))
+    np.savez(tmp_path / "demos.npz", about=json.dumps(about), **given)
+    with pytest.raises(UserError, match="about"):
+        read(str(tmp_path / "demos.npz"), Interpretation(solved="all"))
+
+
+def test_every_damaged_byte_of_an_archive_is_one_line(tmp_path):
+    path, rng = tmp_path / "demos.npz", np.random.default_rng(0)
+    np.savez_compressed(path, lengths=[2], observations=np.arange(6.0).reshape(3, 2), actions=np.zeros((2, 1)), achieved_goals=np.zeros((3, 1)))
+    intact, refused = path.read_bytes(), 0
+    for _ in range(150):
+        damaged = bytearray(intact)
+        damaged[rng.integers(len(damaged))] = rng.integers(256)
+        path.write_bytes(damaged)
+        try:
+            read(str(path), Interpretation(solved="all"))
+        except UserError:
+            refused += 1
+    assert refused > 50
+    np.save(tmp_path / "alone.npy", np.zeros(3))
+    (tmp_path / "alone.npy").rename(path)
+    with pytest.raises(UserError, match="is not an archive"):
+        read(str(path), Interpretation(solved="all"))
+
+
 @pytest.mark.parametrize(
     ("dones", "rewards", "solved", "expected"),
     [
         ([0, 0, 1], [0, 0, 0], "dones", True),
         ([0, 0, 0], [0, 0, 1], "dones", False),
         ([0, 0, 0], [0, 0, 0.5], "reward", True),
-        ([0, 0, 1], [0, 0, 0.0], "reward", None),  # all are rewards of 0, so it is done at the first
+        ([0, 0, 1], [0, 0, 0.0], "reward", False),
         ([0, 0, 1], [-1, -1, 0], "reward", True),
         ([0, 0, 1], [-1, -1, -1], "reward", False),
         ([0, 1, 0], [0, 0, 0], "all", True),

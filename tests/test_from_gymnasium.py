@@ -8,6 +8,7 @@ import pytest
 from point_env import SPEED
 
 import hindrl_jax as hindrl
+from hindrl_jax import from_gymnasium
 from hindrl_jax.errors import UserError
 from hindrl_jax.from_gymnasium import Simulators
 from hindrl_jax.types import Environment
@@ -46,6 +47,8 @@ def test_arguments_go_to_gymnasium_and_survive_the_way_through_a_file():
     assert env.arguments == {"says": "success"}
     assert hindrl.make(env.name, **dataclasses.asdict(env)) == env
     assert hindrl.make(POINT, make_kwargs=["says=reward"]).arguments == {"says": "reward"}  # a list, as JSON has it
+    for word, value in (("False", False), ("false", False), ("None", None), ("null", None), ("3", 3), ("Falsely", "Falsely")):
+        assert from_gymnasium._arguments((f"says={word}",)) == {"says": value}
 
 
 @pytest.mark.parametrize(

@@ -75,6 +75,17 @@ def test_tensorboard_reads_each_seed_and_their_mean(tmp_path):
     assert mean["final/success"] == [(200, 0.625)]
 
 
+@pytest.mark.parametrize("seeds", [(3, 4), (3,)])
+def test_a_reporter_begins_anew_after_a_run_that_was_interrupted(tmp_path, seeds):
+    report = hindrl.TensorBoardReporter(tmp_path)
+    report(result(ROWS))
+    again = [row for row in ROWS[:2] if row.seed in seeds]
+    report(result(again, seeds))
+    assert read(tmp_path / "tensorboard" / "seed_3")["evaluation/success"] == [(100, 0.25)]
+    report(result(again, seeds, final=[0.5] * len(seeds)))
+    assert read(tmp_path / "tensorboard" / "seed_3")["final/success"] == [(100, 0.5)]
+
+
 def test_tensorboard_counts_the_updates_of_bc_and_needs_no_mean_of_one_seed(tmp_path):
     config = dataclasses.replace(CONFIG, algo="bc")
     hindrl.TensorBoardReporter(tmp_path)(result([row(3, 100, 0.25, algo="bc")], [3], config=config, final=[0.5]))

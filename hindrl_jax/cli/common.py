@@ -17,7 +17,7 @@ from hindrl_jax.registry import TASKS
 
 _TYRO = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
 ENV_HELP = "The environment; `hindrl envs` lists them. Any goal-conditioned one of Gymnasium is gymnasium:ID, as in gymnasium:FetchReach-v4."
-console = Console(highlight=False, soft_wrap=True)
+console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
 
 
 def seeds_from(count: int, first: int) -> tuple[int, ...]:

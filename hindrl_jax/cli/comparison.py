@@ -10,7 +10,6 @@ import numpy as np
 import tyro
 from rich import box
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from hindrl_jax import plots
@@ -51,11 +50,11 @@ def compare(arguments: list[str]) -> None:
         raise UserError("nothing to compare: give the directories of two or more runs, or of a sweep")
     runs = read_runs(find_runs(options.directories))
     compared = compared_runs(runs)
-    Console(highlight=False, soft_wrap=True, width=max(console.width, _TABLE_WIDTH)).print(_table(compared))
+    Console(highlight=False, soft_wrap=True, markup=False, emoji=False, width=max(console.width, _TABLE_WIDTH)).print(_table(compared))
     for run in runs[1:]:
-        console.print(f"{run.label}: {_changes_line(changes(run, runs[0]))}", markup=False)
+        console.print(f"{run.label}: {_changes_line(changes(run, runs[0]))}")
     for line in remarks(compared):
-        console.print(f"note: {line}", markup=False)
+        console.print(f"note: {line}")
     if options.csv is not None:
         write_csv(compared, options.csv)
         console.print(f"wrote {options.csv}")
@@ -73,7 +72,7 @@ def _table(compared: list[Comparison]) -> Table:
     for one in compared:
         run = one.run
         table.add_row(
-            escape(run.label) + ("" if run.finished else " *"),
+            run.label + ("" if run.finished else " *"),
             _interval(one.final_success, "{:.1f}%"),
             f"{one.seeds_reaching_95} of {len(run.spec.seeds)}",
             f"{one.steps_to_95:,.0f}{' updates' if run.cloning else ''}" if np.isfinite(one.steps_to_95) else "never",
@@ -87,7 +86,7 @@ def _interval(interval: Interval, form: str) -> str:
     """A share in percent, or a difference in points, with its interval where there is one."""
     estimate, low, high = (100 * value for value in (interval.estimate, interval.low, interval.high))
     number = form.removesuffix("%").replace(".1f", ".0f")
-    return form.format(estimate) + (f" \\[{number.format(low)}, {number.format(high)}]" if np.isfinite(low) else "")
+    return form.format(estimate) + (f" [{number.format(low)}, {number.format(high)}]" if np.isfinite(low) else "")
 
 
 def _changes_line(changed: dict[str, tuple[object, object]]) -> str:

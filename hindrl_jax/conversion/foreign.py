@@ -41,12 +41,12 @@ class Interpretation:
     desired_goal_keys: tuple[str, ...] = ()
     """Modalities that make up the desired goal (default: desired_goal if there is one, else the goal achieved at the end)."""
     solved: Solved = "dones"
-    """Which demonstrations solve the task: those that end with done (in Minari: success, or terminated), those that end with a reward (above 0, or 0
-    where none is above 0), or all."""
+    """Which demonstrations solve the task: those that end with done (in Minari: success, or terminated), those that end with a reward (above 0; or 0
+    where all rewards of the file are 0 or below, and some below), or all."""
     sparse_rewards: bool = False
     """Put a reward of 1 at the end of each solved demonstration and 0 everywhere else, in place of the rewards in the file."""
     cut: bool = False
-    """Cut off what follows the first done (with --solved reward: the first reward above 0) of a demonstration."""
+    """Cut off what follows the first done (with --solved reward: the first such reward) of a demonstration."""
     repeat_last_observation: bool = False
     """Where the observation after the last action is missing, use the last one that is there."""
     action_low: tuple[float, ...] = ()
@@ -115,11 +115,12 @@ def interpret(foreign: ForeignRecording, meaning: Interpretation, env: Restorabl
     Raises:
       UserError: something is missing, out of range or inconsistent; the message names the option that helps.
     """
-    demos = _filtered(foreign, meaning.filter_key)
+    foreign = dataclasses.replace(foreign, demonstrations=tuple(_filtered(foreign, meaning.filter_key)))
+    demos = foreign.demonstrations
     selection = _selection(foreign, meaning, env)
     _check_alike(foreign, demos, selection)
-    last_state = _last_state(env)
-    interpreted = [_interpret_one(foreign, demo, meaning, selection, env, last_state) for demo in demos]
+    last_state, solved_by_zero = _last_state(env), _solved_by_zero(demos)
+    interpreted = [_interpret_one(foreign, demo, meaning, selection, env, last_state, solved_by_zero=solved_by_zero) for demo in demos]
     if not selection["achieved_goal"]:  # one call for all: under JAX, one per demonstration would compile for every length
         goals = np.asarray(env.achieved_goal(jnp.asarray(np.concatenate([demo.observations for demo in interpreted]), jnp.float32)))
         along = np.split(goals, np.cumsum([len(demo) + 1 for demo in interpreted])[:-1])
@@ -205,7 +206,7 @@ def _selection(foreign: ForeignRecording, meaning: Interpretation, env: Restorab
 
 def _columns_of(key: str, shapes: dict[str, int], where: str | None, listed: str) -> _Columns:
     """One key, with [a:b] or [a] for some of its columns; a key of a group stands for all keys in it. Without `where`, a missing one is none."""
-    match = re.fullmatch(r"(?P<key>[^\[\]]+)(\[(?P<start>\d*)(?P<colon>:?)(?P<stop>\d*)\])?", key)
+    match = re.fullmatch(r"(?P<key>[^\[\]]+)(\[(?P<start>\d+|\d*(?=:))(?P<colon>:?)(?P<stop>(?<=:)\d*|)\])?", key)
     name = match["key"] if match else key
     within = [name] if name in shapes else [other for other in shapes if other.startswith(f"{name}/")]
     if not within:
@@ -255,12 +256,14 @@ def _interpret_one(
     selection: dict[str, _Columns],
     env: RestorableEnvironment | None,
     last_state: Callable[..., Any] | None,
+    *,
+    solved_by_zero: bool,
 ) -> Demonstration:
     """The demonstration with all extras that it came with, and without achieved goals where those are to be derived."""
     where = f"{foreign.source}: {demo.name}"
     used = {key for columns in selection.values() for key, _ in columns}
     demo = _with_last_observation(where, demo, used, repeat=meaning.repeat_last_observation)
-    end, solved = _end(where, demo, meaning)
+    end, solved = _end(where, demo, meaning, solved_by_zero=solved_by_zero)
     if end < len(demo.actions):
         demo = _shortened(demo, end)
     rewards = demo.rewards
@@ -324,7 +327,13 @@ def _with_last_observation(where: str, demo: ForeignDemonstration, used: set[str
     return dataclasses.replace(demo, modalities=modalities)
 
 
-def _end(where: str, demo: ForeignDemonstration, meaning: Interpretation) -> tuple[int, bool]:
+def _solved_by_zero(demos: Sequence[ForeignDemonstration]) -> bool:
+    """Whether the rewards of a file are -1 and 0 rather than 0 and 1. One demonstration cannot tell: it may have failed."""
+    rewards = [demo.rewards for demo in demos if demo.rewards is not None and len(demo.rewards)]
+    return bool(rewards) and max(rows.max() for rows in rewards) <= 0 and min(rows.min() for rows in rewards) < 0
+
+
+def _end(where: str, demo: ForeignDemonstration, meaning: Interpretation, *, solved_by_zero: bool) -> tuple[int, bool]:
     """Number of transitions to keep, and whether the last of them solves the task."""
     length = len(demo.actions)
     if meaning.solved == "all":
@@ -333,7 +342,7 @@ def _end(where: str, demo: ForeignDemonstration, meaning: Interpretation) -> tup
     if rows is None:
         others = "reward or --solved all" if what == "dones" else "all"
         raise UserError(f"{where}: has no {what}, so it is not known which demonstrations solve the task; say --solved {others}")
-    times = np.flatnonzero(rows > 0 if what == "dones" or rows.max() > 0 else rows == 0)  # rewards of -1 and 0 are common, too
+    times = np.flatnonzero(rows == 0 if what == "rewards" and solved_by_zero else rows > 0)
     if not times.size:
         return length, False
     first = int(times[0])

@@ -18,14 +18,13 @@ from __future__ import annotations
 
 import io
 import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hindrl_jax.conversion.foreign import ForeignDemonstration, ForeignRecording
-from hindrl_jax.datasets import Demonstration, Recording, check_is_file
+from hindrl_jax.datasets import DAMAGED_ARCHIVE, Demonstration, Recording, check_is_file, read_arrays
 from hindrl_jax.errors import UserError, one_line
 
 _FORMAT_VERSION = 1
@@ -79,9 +78,8 @@ def read(path: Path) -> ForeignRecording | Recording:
     """
     check_is_file(path)
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile) as error:
+        arrays = read_arrays(path)
+    except DAMAGED_ARCHIVE as error:
         raise UserError(f"{path}: is not an archive of NumPy arrays, or is damaged ({one_line(error)}); fetch it again") from error
     about = _about(path, arrays)
     for name in ("lengths", "observations", "actions"):
@@ -102,6 +100,8 @@ def read(path: Path) -> ForeignRecording | Recording:
         if name in arrays:
             _check(path, name, arrays[name], len(lengths), dims)
     names = about.get("names") or [f"demo_{n}" for n in range(len(lengths))]
+    if len(names) != len(lengths):
+        raise UserError(f"{path}: about names {len(names)} demonstrations, but lengths has {len(lengths)}; write it again, or leave the names out")
     if "format_version" in about:
         try:
             return _recording(arrays, split, about, names)
@@ -113,11 +113,17 @@ def read(path: Path) -> ForeignRecording | Recording:
 def _about(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
     try:
         about = json.loads(str(arrays.pop("about", "{}")))
-        if isinstance(about, dict):
-            return about
-    except json.JSONDecodeError:
-        pass
-    raise UserError(f"{path}: the array about is not the text of a JSON object; write it again, or leave it out")
+    except (json.JSONDecodeError, RecursionError):
+        about = None
+    if not isinstance(about, dict):
+        raise UserError(f"{path}: the array about is not the text of a JSON object; write it again, or leave it out")
+    names = about.get("names") or []
+    if not (isinstance(names, list) and all(isinstance(name, str) for name in names) and len({*names}) == len(names)):
+        raise UserError(f"{path}: names in about is no list of different texts; write it again, or leave it out")
+    for name, kind, noun in (("env_kwargs", dict, "object"), ("env_name", str, "text")):
+        if not isinstance(about.get(name) or kind(), kind):
+            raise UserError(f"{path}: {name} in about is no {noun}; write it again, or leave it out")
+    return about
 
 
 def _check(path: Path, name: str, array: np.ndarray, num_rows: int, dims: int) -> None:
