@@ -45,7 +45,7 @@ _ADAM = optax.scale_by_adam()  # the step size is applied apart, since it may ch
 
 
 _LEAST_EXTENT = 1e-6
-_LEAST_VALUE = 0.01
+_LEAST_VALUE = 0.01  # below it, a value is mostly the critics' error
 
 
 class InputScale(struct.PyTreeNode, kw_only=True):
@@ -332,8 +332,8 @@ def _next_action(state: AgentState, config: AgentConfig, block: _Columns) -> tup
     action_dim = block.action.shape[0]
     if config.has_entropy:
         action, log_prob = apply_actor(state.actor, block.next_inputs, config, action_dim=action_dim).at(block.next_noise)
-        weighed_as_rewards = not (config.normalise_value or config.relative_value)
-        return action, -jnp.exp(state.log_alpha) * log_prob if weighed_as_rewards else jnp.zeros_like(log_prob)
+        weight = 0.0 if config.divides_value else jnp.exp(state.log_alpha)
+        return action, -weight * log_prob
     action = apply_actor(state.target_actor, block.next_inputs, config, action_dim=action_dim).mode
     if config.base == "td3":
         noise = jnp.clip(config.target_noise * block.next_noise, -config.target_noise_clip, config.target_noise_clip)

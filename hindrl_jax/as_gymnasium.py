@@ -58,7 +58,8 @@ class _GoalTask:
         self.env = env
         self.goal, self.tolerance = np.asarray(env.task_goal()), env.goal_tolerance
         low, high = env.observation_low, env.observation_high
-        goals = Box(*(np.asarray(env.achieved_goal(bound)) for bound in (low, high)), dtype=np.float32)  # a goal is some entries of an observation
+        # A goal is some entries of an observation, and at both bounds the same ones.
+        goals = Box(*(np.asarray(env.achieved_goal(bound)) for bound in (low, high)), dtype=np.float32)
         self.observation_space = Dict(observation=Box(low, high, dtype=np.float32), achieved_goal=goals, desired_goal=goals)
         self.action_space = Box(-1.0, 1.0, (env.action_dim,), np.float32)
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": env.render_fps}

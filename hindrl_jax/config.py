@@ -49,7 +49,8 @@ class BatchConfig:
     inclusive_goal_test: bool = True
     """A goal counts as reached at distance <= epsilon; false gives the strict < of the thesis's formula and code."""
     terminate_on_relabel: bool = True
-    """Reaching a relabelled goal ends the return; false bootstraps past it, as the thesis does, and values can exceed 1."""
+    """Reaching a relabelled goal ends the return; false bootstraps past it, as the thesis does, and values can exceed 1. Where hindsight changes
+    observations in place of goals (ParameterizedReach), a solved task always does."""
     bound_by_obtained_return: bool = False
     """No target lies below the return that the row's own episode went on to obtain, which is a lower bound of the optimal value where neither
     actions nor rewards are random (He et al., optimality tightening, 2017; Oh et al., self-imitation learning, 2018)."""
@@ -112,6 +113,11 @@ class BatchConfig:
     def max_demo_rows(self) -> int:
         """Number of demonstration rows at the start of training."""
         return int(self.max_demo_ratio * self.batch_size)
+
+    @property
+    def uses_intersections(self) -> bool:
+        """Whether some relabelled goals are those of an intersection, for which the replay notes what lies near."""
+        return "joint_intersection" in dict(self.sources)
 
     @property
     def sources(self) -> tuple[tuple[Any, Any], ...]:
@@ -227,8 +233,8 @@ class AgentConfig:
     """Divide the value in the actor's loss by its mean size over the batch, so that bc_weight weighs alike whatever the values are (TD3+BC,
     Fujimoto and Gu, 2021). The entropy's weight is then in other units than the rewards, so that the critics' targets leave entropy out."""
     relative_value: bool = False
-    """Divide the value in the actor's loss, row by row, by its own size, or by 0.01 if that is more: as if the actor climbed the value's logarithm.
-    One step lost then weighs alike near the reward and far from it. As with normalise_value, the critics' targets leave entropy out."""
+    """Divide the value in the actor's loss, row by row, by itself, or by 0.01 where it is less (negative, too): as if the actor climbed the value's
+    logarithm. One step lost then weighs alike near the reward and far from it. As with normalise_value, the critics' targets leave entropy out."""
     bc_weight: float = 0.01
     """Weight of the behaviour cloning loss on demonstration rows (lambda_BC of the thesis)."""
     final_bc_weight: float | None = None
@@ -283,6 +289,11 @@ class AgentConfig:
     def has_entropy(self) -> bool:
         """Whether the policy is random and rewarded for it; td3 and ddpg have a deterministic one."""
         return self.base in ("tqc", "sac")
+
+    @property
+    def divides_value(self) -> bool:
+        """Whether the value in the actor's loss is divided by a size of its own. The entropy's weight there is then in other units than rewards."""
+        return self.normalise_value or self.relative_value
 
     @property
     def critic_outputs(self) -> int:
@@ -431,7 +442,7 @@ _CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
     ),
     (
         "intersection_goals",
-        lambda c: "joint_intersection" in dict(c.batch.sources),
+        lambda c: c.batch.uses_intersections,
         "only relabelling by joint_intersection uses it: choose --hindrl-sampling-strategy joint_intersection",
     ),
     ("importance_exponent demo_priority_bonus", lambda c: c.batch.has_priorities, "transitions have no priorities: raise --priority-exponent"),

@@ -194,8 +194,13 @@ def check_config(env: RestorableEnvironment, config: TrainConfig) -> None:
             raise UserError(
                 f"behavioural_goals = environment is for Gymnasium's environments: {env.name} gives its episodes no goals; choose another"
             )
-        if isinstance(env, RetellableEnvironment) and "joint_intersection" in dict(config.batch.sources):
-            raise UserError(f"joint_intersection compares goals, and hindsight changes none in {env.name}: choose another hindrl_sampling_strategy")
+        if isinstance(env, RetellableEnvironment):
+            if config.batch.uses_intersections:
+                raise UserError(
+                    f"joint_intersection compares goals, and hindsight changes none in {env.name}: choose another hindrl_sampling_strategy"
+                )
+            if config.goal.has_achieved_goals:
+                raise UserError(f"achieved_goal_ratio is for tasks with other goals than their own, which {env.name} has not: set it to 0")
         return
     if config.goal.behavioural_goals != "environment":
         raise UserError(

@@ -4,7 +4,8 @@
     thesis     the hyperparameters of the thesis's appendix, on plain correct code
     original   the same, with the quirks of the original implementation that explain its published figures
 
-Each has one column for the grid worlds and one for the reach tasks, as the thesis's appendix does. Environments of Gymnasium have the default only.
+Each has one column for the grid worlds and one for the reach tasks, as the thesis's appendix does. Beside them the default has a recipe for HinDRL in
+tasks that are told anew in hindsight (`types.RetellableEnvironment`), such as ParameterizedReach. Environments of Gymnasium have the default only.
 """
 
 from __future__ import annotations
@@ -37,12 +38,13 @@ def preset(algo: Algorithm = "hindrl", name: Preset = "default", *, env: str | E
     for value, kind, known in ((algo, "algorithm", get_args(Algorithm)), (name, "preset", get_args(Preset))):
         if value not in known:
             raise UserError(f"unknown {kind} {value!r}{did_you_mean(value, known)}; choose one of {', '.join(known)}")
-    environment, family = (getattr(task(env if isinstance(env, str) else env.name), field) for field in ("environment", "family"))
+    known_task = task(env if isinstance(env, str) else env.name)
+    family = known_task.family
     if family == "gymnasium":
         if name != "default":
             raise UserError(f"the preset {name} is for the thesis's tasks: choose default for environments of Gymnasium")
         return _as_algorithm(_gymnasium(algo, make(env) if isinstance(env, str) else env), algo)
-    if name == "default" and algo != "bc" and hasattr(environment, "retell"):
+    if name == "default" and algo in ("hindrl", "smooth-hindrl") and hasattr(known_task.environment, "retell"):
         return _as_algorithm(_retold(), algo)
     return _as_algorithm({"default": _default, "thesis": _thesis, "original": _original}[name](algo, family), algo)
 

@@ -1,7 +1,8 @@
 """Replay of whole episodes, and the batches that are drawn from it.
 
 A transition is never stored twice: an episode keeps its T + 1 observations once, next observations and achieved goals are read off the
-following rows, and relabelled goals, rewards and n-step returns are computed when a batch is drawn (the thesis's "online relabelling").
+following rows, and relabelled goals, rewards and n-step returns are computed when a batch is drawn (the thesis's "online relabelling"). So are
+observations, where those hold what an episode is about and it is told anew (`Retelling`).
 
 Every environment owns a ring of episode slots, so that writing needs no bookkeeping between environments. One slot per ring is being written;
 only complete episodes are sampled, and an episode is overwritten as a whole.
@@ -172,9 +173,10 @@ def transitions(
 ) -> Transition:
     """Reads n-step transitions, with the goals and rewards that they were told or have lived.
 
-    The return of row i runs over the steps t, t + 1, ... of its episode. It ends after `n_step` steps, at the end of the episode, or (with
-    `terminate_on_relabel`) where a relabelled goal is reached, whichever comes first. Relabelled rows are rewarded by the box test on the
-    goal achieved after each step (thesis eq. 2.29 and 4.8), retold ones where the task is then solved, the others keep the environment's reward.
+    The return of row i runs over the steps t, t + 1, ... of its episode. It ends after `n_step` steps, at the end of the episode, where a retold
+    story is solved, or (with `terminate_on_relabel`) where a relabelled goal is reached, whichever comes first. Relabelled rows are rewarded by the
+    box test on the goal achieved after each step (thesis eq. 2.29 and 4.8), retold ones where the task is then solved, the others keep the
+    environment's reward.
 
     Args:
       episodes: the table to read.
@@ -193,6 +195,8 @@ def transitions(
       The batch. Where the return ended by termination the discount is 0, else gamma to the number of steps taken.
     """
     lengths, terminated = episodes.lengths[rows], episodes.terminated[rows]
+    if retold is not None:
+        terminated &= ~retold[0]  # where the task was solved in truth, the story may go on
     if config.timeouts_are_terminal:
         terminated = jnp.ones_like(terminated)
     window = steps[:, None] + jnp.arange(n_step)[None]  # (B, n)
@@ -209,7 +213,9 @@ def transitions(
         seen, solved = retell(jnp.concatenate([observations[:, None], next_observations], axis=1))
         observations = jnp.where(is_retold[:, None], seen[:, 0], observations)
         next_observations = jnp.where(is_retold[:, None, None], seen[:, 1:], next_observations)
-        reached, ends = jnp.where(is_retold[:, None], solved, reached), ends & ~is_retold[:, None]
+        solved &= is_retold[:, None]
+        reached |= solved
+        ends |= solved  # whatever terminate_on_relabel says: no row begins in a solved state, so its value is never learnt
         relabelled |= is_retold
     rewards = jnp.where(relabelled[:, None], reached.astype(jnp.float32), rewards)
     if config.terminate_on_relabel:
@@ -287,7 +293,10 @@ def _new_goals(
 
 
 def _new_subgoals(key: Array, replay: ReplayState, rows: Array, steps: Array, table: GoalTable, *, num_subgoals: int, config: BatchConfig) -> Array:
-    """(B, J, D) observations of states from the sources of the config; those of the row's own episode come in the order in which it visited them."""
+    """(B, J, D) observations of states from the sources of the config; those of the row's own episode come in the order in which it visited them.
+
+    A story that needs fewer than J takes the first, so where few subgoals remain, those of "future" tend to be soon.
+    """
     lengths, shape = replay.episodes.lengths, (rows.shape[0], num_subgoals)
 
     def states_from(key: Array, source: Source) -> Array:

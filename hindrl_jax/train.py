@@ -121,7 +121,7 @@ def init(key: Array, data: Guidance, env: Environment, config: TrainConfig, *, b
         num_envs=config.num_envs,
         capacity=smallest if config.algo == "bc" else config.buffer_size,
         horizon=env.horizon,
-        keep_nearby_goals=_uses_intersections(config),
+        keep_nearby_goals=config.batch.uses_intersections,
         **dims,
     )
     if config.batch.has_priorities:
@@ -140,10 +140,6 @@ def init(key: Array, data: Guidance, env: Environment, config: TrainConfig, *, b
 
 def _dims(env: Environment) -> dict[str, int]:
     return dict(observation_dim=env.observation_dim, goal_dim=env.goal_dim, action_dim=env.action_dim)
-
-
-def _uses_intersections(config: TrainConfig) -> bool:
-    return "joint_intersection" in dict(config.batch.sources)
 
 
 def _new_episodes(key: Array, data: Guidance, env: Environment, config: TrainConfig, progress: Array | float) -> RolloutState:
@@ -243,7 +239,7 @@ def remember(
     """
     before, progress = state.rollout, _progress(state, config)
     nearby_goal = None
-    if _uses_intersections(config):
+    if config.batch.uses_intersections:
         achieved, inclusive = env.achieved_goal(time_step.observation), config.batch.inclusive_goal_test
         nearby_goal = goals.nearby_goal(key_nearby, data.goals, achieved, data.epsilon, inclusive=inclusive)
     stored = replay.add(

@@ -192,3 +192,10 @@ def test_a_nearby_goal_is_any_of_them_with_equal_chances():
     counts = np.bincount(np.asarray(pick(jax.random.split(jax.random.key(1), 1500))), minlength=5)
     assert counts[[1, 3]].tolist() == [0, 0]
     assert np.abs(counts[[0, 2, 4]] - 500).max() < 90
+
+
+def test_observations_stay_beside_the_goals_that_were_reached_there():
+    observations = jnp.concatenate([GOALS * 10.0, -GOALS], axis=-1)
+    table = goal_table(GOALS, LENGTHS, jnp.full(GOALS.shape[-1], 0.5), filtered=True, exclude_last=True, observations=observations)
+    count = int(table.count)
+    np.testing.assert_array_equal(table.observations[:count], np.concatenate([table.goals * 10.0, -table.goals], axis=-1)[:count])

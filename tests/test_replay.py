@@ -292,11 +292,15 @@ def draw_retold_batch(key, replay, config):
     return sample_batch(key, replay, demonstrations(), table, retelling=replays.Retelling(tell, 2), **given)
 
 
-@pytest.mark.parametrize("strategy", ["final", "future", "episode", "random", "task_conditioned", "joint_union"])
-def test_a_retold_row_is_about_states_of_its_source_in_their_order(strategy):
+RETOLD = [(strategy, {}) for strategy in ("final", "future", "episode", "random", "task_conditioned", "joint_union")]
+RETOLD += [("future", {"terminate_on_relabel": False}), ("random", {"timeouts_are_terminal": True})]
+
+
+@pytest.mark.parametrize(("strategy", "rules"), RETOLD)
+def test_a_retold_row_is_about_states_of_its_source_in_their_order(strategy, rules):
     history, story = replay_history([[3, 2], [1, 3]])
     replay, sources = at(history, 17), kept(story[17])  # early: episodes have numbers of one digit
-    config = dataclasses.replace(BATCH, hindrl_sampling_strategy=strategy)
+    config = dataclasses.replace(BATCH, hindrl_sampling_strategy=strategy, **rules)
     batch = jax.device_get(draw_retold_batch(jax.random.key(0), replay, config))
     retold = np.flatnonzero(batch.is_relabelled)
     assert retold.tolist() == list(range(NUM_DEMO, NUM_DEMO + NUM_RELABELLED))
@@ -311,6 +315,8 @@ def test_a_retold_row_is_about_states_of_its_source_in_their_order(strategy):
             assert second in own
             assert first <= second
             assert strategy != "future" or first[2] > t
+        if strategy == "random":
+            assert all(sources[other[:2]] >= other[2] for other in (first, second))
         if strategy == "task_conditioned":
             assert {first, second} <= set(DEMO_STATES)
         if strategy == "joint_union":
@@ -320,13 +326,15 @@ def test_a_retold_row_is_about_states_of_its_source_in_their_order(strategy):
         for step in range(t, min(t + 2, length)):
             solved = step + 1 >= second[2]
             expected_reward, expected_discount, following = expected_reward + expected_discount * solved, expected_discount * 0.5, step + 1
-            if solved:
+            if solved or (config.timeouts_are_terminal and step + 1 == length):
                 expected_discount = 0.0
                 break
         assert (batch.reward[row], batch.discount[row], batch.next_observation[row, 2]) == (expected_reward, expected_discount, following)
         assert batch.next_observation[row, 0] == batch.observation[row, 0]
         assert batch.desired_goal[row, 0] == -1 - env  # the goal that the episode was acted under
         assert batch.obtained_return[row] == 0.0
+    foreign = (batch.observation[retold, 0] // 1000 % 10 == DEMO).mean()
+    assert {"task_conditioned": foreign == 1.0, "joint_union": 0.0 < foreign < 1.0}.get(strategy, foreign == 0.0)
 
 
 @functools.partial(jax.jit, static_argnames="config", compiler_options=FAST_COMPILATION)

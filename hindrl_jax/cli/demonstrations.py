@@ -31,7 +31,7 @@ from hindrl_jax.conversion import (
     understand,
     write,
 )
-from hindrl_jax.datasets import Recording, check_can_write, describe_demonstrations, padded, read_states, save_demonstrations, summarise_recording
+from hindrl_jax.datasets import Recording, check_can_write, padded, save_demonstrations, summarise_recording
 from hindrl_jax.errors import UserError
 from hindrl_jax.experiment import record_demonstrations
 from hindrl_jax.goals import epsilon_filter, epsilon_from_demonstrations, goal_table
@@ -214,8 +214,7 @@ class PlotDemo:
 def plot(arguments: list[str]) -> None:
     """Draw what the epsilon filter keeps of a demonstration."""
     options, meaning, env = _parse_with_meaning(PlotDemo, arguments, "hindrl demos plot", plot.__doc__)
-    here = options.source.rpartition("/")[2].removeprefix(MINARI_PREFIX) if options.source.startswith(MINARI_PREFIX) else options.source
-    path = options.to or Path(here).with_suffix(".png")
+    path = options.to or _beside(options.source, ".png")
     if path.suffix != ".png":
         raise UserError(f"cannot draw {path.name}: the name must end in .png")
     _check_epsilon(options.m, options.k)
@@ -233,6 +232,11 @@ def plot(arguments: list[str]) -> None:
     with disk_trouble(path):
         save_filter(goals, kept, np.asarray(epsilon), path, dims=dims, title=title)
     console.print(f"wrote {path}: the filter keeps {kept.sum()} of {len(kept)} goals")
+
+
+def _beside(source: str, suffix: str) -> Path:
+    """Where a picture of demonstrations goes: beside their file, or for a dataset of Minari here."""
+    return Path(source.removeprefix(MINARI_PREFIX).rpartition("/")[2] if source.startswith(MINARI_PREFIX) else source).with_suffix(suffix)
 
 
 def _continuous(goals: np.ndarray) -> np.ndarray:
@@ -318,8 +322,8 @@ def _check_demo(demo: int, num_demos: int, file: Path | str) -> None:
 class RenderDemo:
     """Film demonstrations."""
 
-    file: tyro.conf.Positional[Path]
-    """The HDF5 file."""
+    source: tyro.conf.Positional[str]
+    """The file, of hindrl_jax or another tool (.hdf5, .npz), or minari:NAME-v0, with states of one of our environments."""
     to: Path | None = None
     """A .gif or .mp4 file, or a .png file for the last state (default: the file's name with .gif). For .mp4 install av."""
     demo: int = 0
@@ -330,14 +334,16 @@ class RenderDemo:
 
 def render(arguments: list[str]) -> None:
     """Film demonstrations."""
-    options = parse(RenderDemo, arguments, "hindrl demos render")
-    summary = describe_demonstrations(options.file)
-    states = read_states(options.file)
+    options, meaning, env = _parse_with_meaning(RenderDemo, arguments, "hindrl demos render", render.__doc__)
+    recording = read(options.source, meaning, env)
+    states = [demo.states for demo in recording.demonstrations]
+    if any(one is None for one in states):
+        raise UserError(f"{options.source}: holds no states of one of our environments, which a film takes; render what hindrl demos record wrote")
     if options.episodes < 1:
         raise UserError(f"--episodes {options.episodes} is too few: film at least 1")
     for demo in (options.demo, options.demo + options.episodes - 1):
-        _check_demo(demo, len(states), options.file)
-    path = options.to or options.file.with_suffix(".gif")
+        _check_demo(demo, len(states), options.source)
+    path = options.to or _beside(options.source, ".gif")
     shown = states[options.demo : options.demo + options.episodes]
-    draw_episodes(path, make(summary.env_name, **summary.env_kwargs), shown)
+    draw_episodes(path, make(recording.env_name, **recording.env_kwargs), shown)
     console.print(f"wrote {path}: {sum(len(one) - 1 for one in shown)} steps{f' of {len(shown)} demonstrations' if len(shown) > 1 else ''}")

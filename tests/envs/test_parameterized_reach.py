@@ -346,8 +346,8 @@ def test_a_story_told_anew_is_what_would_have_been_observed(arguments):
     state = place(
         np.linspace((0.1, 0.0, 0.1), (-0.1, 0.2, 0.0), count), np.linspace((0.3, 0, 0), (0, 0, 0.2), count), joints=joints[0], num_reached=1
     )
-    look = compiled(jax.vmap(lambda q: env.observe(state.replace(joints=q))))
-    observations = look(jnp.asarray(joints, jnp.float32))
+    look = compiled(jax.vmap(lambda q, reached: env.observe(state.replace(joints=q, num_reached=reached))))
+    observations = look(jnp.asarray(joints, jnp.float32), jnp.asarray(np.arange(30) >= 8, jnp.int32))  # lived, a waypoint is reached on the way
     retell, arrive = compiled(env.retell), compiled(env.arrive)
     told_counts, solved_at_all = set(), []
     for seed in range(12):
