@@ -7,10 +7,13 @@ for one), all float32 within bounds.
   * The desired goal is the same in every episode: `env.task_goal()`, which says that the task is solved, not where things are. Where they are to
     be brought is part of the observation, or, in the fixed reach task, is not observed at all.
   * The reward is the environment's own: 1 at the step that solves the task, else 0. That step terminates the episode. The horizon truncates it: it
-    is Gymnasium's `max_episode_steps`.
+    is Gymnasium's `max_episode_steps`. With `continuing_task=True`, as in the mazes of Gymnasium-Robotics, the episode goes on until the horizon,
+    with a reward of 1 for each step at the goal. Hindsight that ends no episode at the goals that it draws (Stable-Baselines3's HER) needs that:
+    they are worth up to 1 / (1 - gamma) there, against 1 for the task's own.
   * compute_reward(achieved_goal, desired_goal, info) is 1 where |achieved - desired| <= `env.goal_tolerance` in every dimension. For the desired goal
     it agrees with the reward of every step; an environment with rules under which it could not is refused.
-  * info["is_success"] says whether the episode was solved at this step.
+  * info["is_success"] says whether the reward is 1: in a continuing task, whether the goal is reached now. A grid has no action to stay, and an agent
+    that releases the last object can no longer hold it at the goal; so count solved episodes without `continuing_task`.
 """
 
 from __future__ import annotations
@@ -36,16 +39,16 @@ from hindrl_jax.registry import make, viewer
 from hindrl_jax.types import Array, RestorableEnvironment, action_to_env, compiler_options, tree_where
 
 Observation = dict[str, np.ndarray]
-_NEVER = 2**31 - 1  # the horizon of an environment that nobody, or somebody else, cuts
+_NEVER = 2**31 - 1  # the horizon of an environment whose episodes are cut here, or by Gymnasium
 
 
 class _GoalTask:
     """What one environment and many side by side have in common: the environment, its spaces, and the goal test."""
 
-    def __init__(self, name: str, horizon: int, arguments: dict[str, Any], render_mode: str | None):
+    def __init__(self, name: str, arguments: dict[str, Any], render_mode: str | None, continuing_task: bool):
         if "horizon" in arguments:
             raise UserError(f"horizon = {arguments['horizon']} is not for Gymnasium, which has max_episode_steps: give that")
-        env = make(name, horizon=horizon, **arguments)
+        env = make(name, horizon=_NEVER, **arguments)
         if on_host(env):
             raise UserError(f"{name} cannot be stepped here with backend = 'robosuite': choose 'closed_form' or 'mjx'")
         if env.goal_tolerance is None:
@@ -55,6 +58,8 @@ class _GoalTask:
             )
         if render_mode not in (None, "rgb_array"):
             raise UserError(f"render_mode = {render_mode!r} is not usable: choose 'rgb_array' or None")
+        if not isinstance(continuing_task, bool):
+            raise UserError(f"continuing_task = {continuing_task!r} is not usable: choose True or False")
         self.env = env
         self.goal, self.tolerance = np.asarray(env.task_goal()), env.goal_tolerance
         low, high = env.observation_low, env.observation_high
@@ -75,11 +80,16 @@ class _GoalTask:
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> np.ndarray:
         """1 where the goal is reached, else 0: goals (..., G) -> (...) float32. `info` is not used."""
         del info
-        return np.all(np.abs(np.asarray(achieved_goal) - desired_goal) <= self.tolerance, axis=-1).astype(np.float32)
+        return _is_reached(np.asarray(achieved_goal), np.asarray(desired_goal), self.tolerance).astype(np.float32)
 
     def picture(self, state: Any) -> np.ndarray:
         """(H, W, 3) uint8."""
         return viewer(self.env).frame(self.env, state)
+
+
+def _is_reached(achieved_goal: Any, desired_goal: Any, tolerance: Any) -> Any:
+    """Goals (..., G), of NumPy or of JAX -> (...) bool."""
+    return (abs(achieved_goal - desired_goal) <= tolerance).all(axis=-1)
 
 
 def _pack(env: RestorableEnvironment, observation: Array, *results: Array | float) -> Array:
@@ -94,9 +104,14 @@ def _start(env: RestorableEnvironment, seed: Array, episode: Array) -> tuple[Any
     return state, _pack(env, observation, 0.0, 0.0, 0.0)
 
 
-def _step(env: RestorableEnvironment, state: Any, action: Array) -> tuple[Any, Array]:
+def _step(env: RestorableEnvironment, continuing_task: bool, state: Any, action: Array) -> tuple[Any, Array]:
+    """The next state, and its row, in which nothing is truncated yet."""
     state, time_step = env.step(state, action_to_env(jnp.clip(action, -1.0, 1.0), env))
-    return state, _pack(env, time_step.observation, time_step.reward, time_step.terminated, time_step.truncated)
+    if continuing_task:
+        observation = jnp.clip(time_step.observation, env.observation_low, env.observation_high)
+        reward = _is_reached(env.achieved_goal(observation), env.task_goal(), env.goal_tolerance)
+        return state, _pack(env, observation, reward, 0.0, 0.0)
+    return state, _pack(env, time_step.observation, time_step.reward, time_step.terminated, 0.0)
 
 
 def _draw_seed(generator: np.random.Generator) -> int:
@@ -104,9 +119,10 @@ def _draw_seed(generator: np.random.Generator) -> int:
 
 
 @functools.cache
-def _programs(env: RestorableEnvironment) -> tuple[Any, Any]:
+def _programs(env: RestorableEnvironment, continuing_task: bool) -> tuple[Any, Any]:
     """`_start` and `_step`, compiled once for all environments that are equal."""
-    return tuple(jax.jit(functools.partial(function, env), compiler_options=compiler_options(env)) for function in (_start, _step))
+    functions = functools.partial(_start, env), functools.partial(_step, env, continuing_task)
+    return tuple(jax.jit(function, compiler_options=compiler_options(env)) for function in functions)
 
 
 class GoalEnv(gymnasium.Env[Observation, np.ndarray]):
@@ -115,6 +131,7 @@ class GoalEnv(gymnasium.Env[Observation, np.ndarray]):
     Args:
       name: of the environment, as in `hindrl_jax.make`.
       render_mode: None, or "rgb_array".
+      continuing_task: whether an episode goes on once it is solved, see above.
       **arguments: fields of the environment but `horizon`, which is Gymnasium's `max_episode_steps`.
 
     Raises:
@@ -123,11 +140,11 @@ class GoalEnv(gymnasium.Env[Observation, np.ndarray]):
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012, as Gymnasium reads it off the class
 
-    def __init__(self, name: str, *, render_mode: str | None = None, **arguments: Any):
-        self._task = _GoalTask(name, _NEVER, arguments, render_mode)
+    def __init__(self, name: str, *, render_mode: str | None = None, continuing_task: bool = False, **arguments: Any):
+        self._task = _GoalTask(name, arguments, render_mode, continuing_task)
         self.observation_space, self.action_space = self._task.observation_space, self._task.action_space
         self.metadata, self.render_mode = self._task.metadata, render_mode
-        self._start, self._step = _programs(self._task.env)
+        self._start, self._step = _programs(self._task.env, continuing_task)
         self._cpu = jax.devices("cpu")[0]
         self._seed: int | None = None
         self._episode = 0
@@ -149,7 +166,7 @@ class GoalEnv(gymnasium.Env[Observation, np.ndarray]):
         with jax.default_device(self._cpu):
             self._state, row = self._step(self._state, np.asarray(action, np.float32))
         observation, reward, terminated, truncated = self._task.unpack(row)
-        return observation, float(reward), bool(terminated), bool(truncated), {"is_success": bool(terminated)}
+        return observation, float(reward), bool(terminated), bool(truncated), {"is_success": bool(reward > 0.0)}
 
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> np.ndarray:
         """1 where the goal is reached, else 0: goals (..., G) -> (...) float32. `info` is not used."""
@@ -168,15 +185,16 @@ class _Lives:
     rows: Array  # (E, D + G + 3), what was said last
     seeds: Array  # (E,) uint32
     episodes: Array  # (E,) int32, which of the seed's episodes this is
+    steps: Array  # (E,) int32, taken in this episode
 
 
 @functools.cache
-def _vector_programs(env: RestorableEnvironment, mode: AutoresetMode) -> tuple[Any, Any, Any]:
+def _vector_programs(env: RestorableEnvironment, continuing_task: bool, max_episode_steps: int, mode: AutoresetMode) -> tuple[Any, Any, Any]:
     """The compiled start, restart and step of E environments."""
 
     def start(seeds: Array, episodes: Array) -> _Lives:
         states, rows = jax.vmap(functools.partial(_start, env))(seeds, episodes)
-        return _Lives(states=states, rows=rows, seeds=seeds, episodes=episodes)
+        return _Lives(states=states, rows=rows, seeds=seeds, episodes=episodes, steps=jnp.zeros_like(episodes))
 
     def restart(lives: _Lives, chosen: Array, seeds: Array, is_new: Array) -> _Lives:
         """New episodes where `chosen`: the next ones, or where the seed is new its first."""
@@ -184,8 +202,10 @@ def _vector_programs(env: RestorableEnvironment, mode: AutoresetMode) -> tuple[A
 
     def step(lives: _Lives, actions: Array) -> tuple[_Lives, Array]:
         """The environments after the step, and the rows before any of them began anew at its end."""
-        states, rows = jax.vmap(functools.partial(_step, env))(lives.states, actions)
-        stepped = lives.replace(states=states, rows=rows)
+        states, rows = jax.vmap(functools.partial(_step, env, continuing_task))(lives.states, actions)
+        steps = lives.steps + 1
+        rows = rows.at[:, -1].set(steps >= max_episode_steps)  # also where the step solves the task, as Gymnasium's own limit has it
+        stepped = lives.replace(states=states, rows=rows, steps=steps)
         if mode is AutoresetMode.DISABLED:
             return stepped, rows
         ended = jnp.any((lives.rows if mode is AutoresetMode.NEXT_STEP else rows)[:, -2:] > 0.0, axis=1)
@@ -203,9 +223,9 @@ class GoalVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
     Given the same seed, its episodes are those of E single environments (`vectorization_mode="sync"`).
 
     Args:
-      name, render_mode, arguments: as for `GoalEnv`.
+      name, render_mode, continuing_task, arguments: as for `GoalEnv`.
       num_envs: E.
-      max_episode_steps: number of steps after which an episode is truncated; None is never.
+      max_episode_steps: number of steps after which an episode is truncated; None or -1 is never.
       autoreset_mode: when an ended episode gives way to the next. "NextStep", Gymnasium's default: at the next step, whose action is ignored.
         "SameStep": at once; its last observation is in info["final_obs"]. "Disabled": by `reset`, with options {"reset_mask": (E,) bool}.
     """
@@ -217,11 +237,15 @@ class GoalVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         num_envs: int = 1,
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
+        continuing_task: bool = False,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         **arguments: Any,
     ):
         super().__init__()
-        self._task = _GoalTask(name, max_episode_steps or _NEVER, arguments, render_mode)
+        limit: Any = _NEVER if max_episode_steps in (None, -1) else max_episode_steps  # -1 is Gymnasium's word for never
+        if not isinstance(limit, numbers.Integral) or limit < 1:
+            raise UserError(f"max_episode_steps = {limit!r} is not usable: it must be at least 1, or -1 for never")
+        self._task = _GoalTask(name, arguments, render_mode, continuing_task)
         self.num_envs, self.render_mode = num_envs, render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self._task.metadata, "autoreset_mode": self.autoreset_mode}
@@ -229,7 +253,7 @@ class GoalVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         self.observation_space, self.action_space = (
             batch_space(space, num_envs) for space in (self.single_observation_space, self.single_action_space)
         )
-        self._start, self._restart, self._step = _vector_programs(self._task.env, self.autoreset_mode)
+        self._start, self._restart, self._step = _vector_programs(self._task.env, continuing_task, int(limit), self.autoreset_mode)
         self._lives: _Lives | None = None
 
     def reset(self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
@@ -264,13 +288,13 @@ class GoalVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         observation, reward, terminated, truncated = self._task.unpack(self._lives.rows)
         ended = terminated | truncated
         if self.autoreset_mode is not AutoresetMode.SAME_STEP or not ended.any():
-            return observation, reward.astype(np.float64), terminated, truncated, self._info(terminated)
+            return observation, reward.astype(np.float64), terminated, truncated, self._info(reward > 0.0)
         final, *_ = self._task.unpack(rows)
         final_obs = np.full(self.num_envs, None, object)
         for i in np.flatnonzero(ended):
             final_obs[i] = {name: values[i] for name, values in final.items()}
-        info = {"final_obs": final_obs, "_final_obs": ended, "final_info": self._info(terminated, ended), "_final_info": ended}
-        return observation, reward.astype(np.float64), terminated, truncated, self._info(terminated & ~ended) | info
+        info = {"final_obs": final_obs, "_final_obs": ended, "final_info": self._info(reward > 0.0, ended), "_final_info": ended}
+        return observation, reward.astype(np.float64), terminated, truncated, self._info((reward > 0.0) & ~ended) | info
 
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> np.ndarray:
         """As of `GoalEnv`."""

@@ -321,6 +321,10 @@ class TrainConfig:
     demo_reset_curriculum: float = 0.0
     """Share of the run over which those states widen from the end of each demonstration to all of it: a reverse curriculum (RFCL, Tao et al.,
     2024, widens by success instead). 0 draws from all of them throughout."""
+    random_truncation: float = 0.0
+    """Probability with which a training episode is cut off after a step, as a time-out cuts it: the future value still counts (unless
+    timeouts_are_terminal). Episodes that stand still are left sooner, and more are begun. Evaluations are never cut. Each episode keeps room for a
+    whole horizon in the replay, which so holds fewer transitions than buffer_size."""
     bc_warm_start: int = 0
     """Gradient steps of behaviour cloning alone before the first of reinforcement learning, after the random actions of learning_starts."""
     pretrain_updates: int = 0
@@ -348,6 +352,7 @@ class TrainConfig:
             learning_starts=(self.learning_starts >= 0, "0 or more"),
             demo_reset_ratio=(0.0 <= self.demo_reset_ratio <= 1.0, "between 0 and 1"),
             demo_reset_curriculum=(0.0 <= self.demo_reset_curriculum <= 1.0, "between 0 and 1"),
+            random_truncation=(0.0 <= self.random_truncation < 1.0, "0 or more, and less than 1"),
             bc_warm_start=(self.bc_warm_start >= 0, "0 or more"),
             agent_resets=(
                 all(0.0 < share < 1.0 for share in self.agent_resets) and sorted(set(self.agent_resets)) == list(self.agent_resets),
@@ -418,7 +423,7 @@ _CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
         "achieved_goal_ratio final_achieved_goal_ratio clip_targets num_critics num_target_critics num_quantiles top_quantiles_to_drop_per_net "
         "layer_norm target_update_rate initial_alpha target_entropy final_target_entropy actor_delay exploration_noise target_noise "
         "target_noise_clip normalise_value relative_value bc_weight final_bc_weight agent_resets num_envs updates_per_iteration learning_starts "
-        "buffer_size demo_reset_ratio demo_reset_curriculum",
+        "buffer_size demo_reset_ratio demo_reset_curriculum random_truncation",
         lambda config: config.algo != "bc",
         "behaviour cloning does not use it: choose another algo",
     ),

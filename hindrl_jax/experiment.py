@@ -209,6 +209,8 @@ def check_config(env: RestorableEnvironment, config: TrainConfig) -> None:
         )
     if config.demo_reset_ratio > 0.0:
         raise UserError(f"demo_reset_ratio = {config.demo_reset_ratio} cannot be had in {env.name}, whose states are not known: set it to 0")
+    if config.random_truncation > 0.0:
+        raise UserError(f"random_truncation = {config.random_truncation} is for environments in JAX, which {env.name} is not: set it to 0")
     if config.agent_resets:
         raise UserError(f"agent_resets = {config.agent_resets} is for environments in JAX, which {env.name} is not: set it to ()")
 

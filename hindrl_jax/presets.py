@@ -59,6 +59,20 @@ def _as_algorithm(config: TrainConfig, algo: Algorithm) -> TrainConfig:
     return dataclasses.replace(config, algo=algo, batch=batch, goal=goal)
 
 
+_ARM_AGENT = AgentConfig(
+    layer_norm=True,
+    final_learning_rate=1e-5,
+    clip_targets=True,
+    actor_average_rate=1.0,
+    actor_average_span=0.5,
+    final_target_entropy=-8.0,
+    relative_value=True,
+    bc_weight=0.03,
+    final_bc_weight=0.0,
+)
+"""What both recipes for the arm have in common: less and less cloning and noise, and an actor that climbs the value relative to its size."""
+
+
 def _default(algo: Algorithm, family: Family) -> TrainConfig:
     """The project's own recipe; for the grid `TrainConfig()` for longer, and with a second life."""
     encoding: Literal["standardised", "multiscale"] = "standardised" if family == "reach" else "multiscale"
@@ -74,25 +88,16 @@ def _default(algo: Algorithm, family: Family) -> TrainConfig:
         return TrainConfig(steps=240_000, agent_resets=(1 / 3,))
     return TrainConfig(
         steps=44_000,
-        num_envs=16,
-        updates_per_iteration=32,
-        learning_starts=4_800,
+        num_envs=8,
+        updates_per_iteration=8,
+        learning_starts=2_400,
         demo_reset_ratio=0.75,
+        random_truncation=0.01,
         eval_every=4_000,
         eval_episodes=20,
         batch=BatchConfig(n_step=10, gamma=0.99, bound_by_obtained_return=True),
         goal=GoalConfig(m=5, k=0.0),
-        agent=AgentConfig(
-            layer_norm=True,
-            learning_rate=3e-4,
-            final_learning_rate=3e-5,
-            clip_targets=True,
-            target_update_rate=0.01,
-            actor_average_rate=1.0,
-            actor_average_span=0.5,
-            bc_weight=0.03,
-            input_encoding=encoding,
-        ),
+        agent=dataclasses.replace(_ARM_AGENT, target_update_rate=0.01, input_encoding=encoding),
     )
 
 
@@ -107,17 +112,7 @@ def _retold() -> TrainConfig:
         eval_every=10_000,
         batch=BatchConfig(n_step=3, max_demo_ratio=0.125, num_sampled_goals=4.0, hindrl_sampling_strategy="joint_union"),
         goal=GoalConfig(m=5, behavioural_goals="task"),
-        agent=AgentConfig(
-            layer_norm=True,
-            final_learning_rate=1e-5,
-            clip_targets=True,
-            actor_average_rate=1.0,
-            actor_average_span=0.5,
-            final_target_entropy=-8.0,
-            relative_value=True,
-            bc_weight=0.03,
-            final_bc_weight=0.0,
-        ),
+        agent=_ARM_AGENT,
     )
 
 

@@ -157,92 +157,113 @@ def sample_steps(key: Array, episodes: Episodes, rows: Array) -> Array:
     return uniform_index(key, rows.shape, jnp.maximum(episodes.lengths[rows], 1))
 
 
-def transitions(
-    episodes: Episodes,
-    rows: Array,
-    steps: Array,
-    *,
-    achieved_goal: Callable[[Array], Array],
-    new_goals: Array,
-    relabelled: Array,
-    epsilon: Array,
-    is_demonstration: bool,
-    n_step: int,
-    config: BatchConfig,
-    retold: tuple[Array, Callable[[Array], tuple[Array, Array]]] | None = None,
-) -> Transition:
-    """Reads n-step transitions, with the goals and rewards that they were told or have lived.
+class Steps(struct.PyTreeNode, kw_only=True):
+    """The n steps from each of B drawn transitions on, over which its return is taken. Past the end of the episode its last step is repeated."""
 
-    The return of row i runs over the steps t, t + 1, ... of its episode. It ends after `n_step` steps, at the end of the episode, where a retold
-    story is solved, or (with `terminate_on_relabel`) where a relabelled goal is reached, whichever comes first. Relabelled rows are rewarded by the
-    box test on the goal achieved after each step (thesis eq. 2.29 and 4.8), retold ones where the task is then solved, the others keep the
-    environment's reward.
+    rows: Array  # (B,) int32, episodes
+    steps: Array  # (B,) int32, of the drawn transitions
+    observation: Array  # (B, D), before the first step
+    next_observations: Array  # (B, n, D), after each
+    rewards: Array  # (B, n)
+    inside: Array  # (B, n) bool, whether the episode was not over before
+    is_last: Array  # (B, n) bool, whether it is over after
+    terminated: Array  # (B,) bool, whether that is the end of the task
+    ends: Array  # (B, n) bool, whether hindsight has the task end there
+
+
+def read_steps(episodes: Episodes, rows: Array, steps: Array, n_step: int) -> Steps:
+    """Reads `n_step` steps as they were lived: rows and steps (B,) int32."""
+    lengths = episodes.lengths[rows][:, None]
+    window = steps[:, None] + jnp.arange(n_step)[None]
+    inside = window < lengths
+    window = jnp.minimum(window, lengths - 1)
+    return Steps(
+        rows=rows,
+        steps=steps,
+        observation=episodes.observations[rows, steps],
+        next_observations=episodes.observations[rows[:, None], window + 1],
+        rewards=episodes.rewards[rows[:, None], window],
+        inside=inside,
+        is_last=window == lengths - 1,
+        terminated=episodes.terminated[rows],
+        ends=jnp.zeros_like(inside),
+    )
+
+
+def judge_by_goals(
+    lived: Steps, chosen: Array, goals: Array, *, achieved_goal: Callable[[Array], Array], epsilon: Array, config: BatchConfig
+) -> Steps:
+    """Rewards the chosen rows (B,) where they reach goals (B, G), by the box test on the goal achieved after each step (thesis eq. 2.29 and 4.8).
+
+    With `terminate_on_relabel` they end there.
+    """
+    reached = goal_reached(achieved_goal(lived.next_observations), goals[:, None], epsilon, inclusive=config.inclusive_goal_test) & chosen[:, None]
+    judged = lived.replace(rewards=jnp.where(chosen[:, None], reached.astype(jnp.float32), lived.rewards))
+    return judged.replace(ends=lived.ends | reached) if config.terminate_on_relabel else judged
+
+
+def retell(lived: Steps, chosen: Array, tell: Callable[[Array], tuple[Array, Array]]) -> Steps:
+    """Tells the chosen rows (B,) anew: rewarded, and over, where the task is then solved.
+
+    They end there whatever `terminate_on_relabel` says: no row begins in a solved state, so the value of one is never learnt.
 
     Args:
-      episodes: the table to read.
-      rows, steps: (B,) int32, episode and transition index.
-      achieved_goal: projection of observations (..., D) to goals (..., G).
-      new_goals: (B, G), used where relabelled or retold.
-      relabelled: (B,) bool.
-      epsilon: (G,) half-width of the goal box.
+      lived, chosen: see above.
+      tell: observations (B, n + 1, D) -> what is seen in their place, and (B, n) bool, whether the task is solved after each step.
+    """
+    seen, solved = tell(jnp.concatenate([lived.observation[:, None], lived.next_observations], axis=1))
+    solved &= chosen[:, None]
+    return lived.replace(
+        observation=jnp.where(chosen[:, None], seen[:, 0], lived.observation),
+        next_observations=jnp.where(chosen[:, None, None], seen[:, 1:], lived.next_observations),
+        rewards=jnp.where(chosen[:, None], solved.astype(jnp.float32), lived.rewards),
+        terminated=lived.terminated & ~chosen,  # where the task was solved in truth, the story may go on
+        ends=lived.ends | solved,
+    )
+
+
+def transitions(
+    episodes: Episodes, told: Steps, desired_goals: Array, *, by_hindsight: Array, is_demonstration: bool, config: BatchConfig
+) -> Transition:
+    """The n-step transitions of steps as they are told.
+
+    A return ends after n steps, at the end of the episode, or where hindsight has the task end, whichever comes first.
+
+    Args:
+      episodes: where the steps were read.
+      told: B rows of n steps.
+      desired_goals: (B, G).
+      by_hindsight: (B,) bool, rows that were judged by their goals or told anew: what their episodes obtained says nothing of them.
       is_demonstration: marks the rows for the behaviour cloning loss.
-      n_step: the largest number of steps of a return.
-      config: gamma and the rules of termination.
-      retold: which rows (B,) are told anew, none of them relabelled, and how: observations (B, n + 1, D) -> what is seen in their place, and (B, n)
-        bool, whether the task is solved after each step.
+      config: gamma, and the rules of termination.
 
     Returns:
       The batch. Where the return ended by termination the discount is 0, else gamma to the number of steps taken.
     """
-    lengths, terminated = episodes.lengths[rows], episodes.terminated[rows]
-    if retold is not None:
-        terminated &= ~retold[0]  # where the task was solved in truth, the story may go on
-    if config.timeouts_are_terminal:
-        terminated = jnp.ones_like(terminated)
-    window = steps[:, None] + jnp.arange(n_step)[None]  # (B, n)
-    inside = window < lengths[:, None]
-    window = jnp.minimum(window, lengths[:, None] - 1)
-    rewards = episodes.rewards[rows[:, None], window]
-    observations = episodes.observations[rows, steps]
-    next_observations = episodes.observations[rows[:, None], window + 1]  # (B, n, D)
-    reached = goal_reached(achieved_goal(next_observations), new_goals[:, None], epsilon, inclusive=config.inclusive_goal_test)
-    reached &= relabelled[:, None]
-    ends = (window == lengths[:, None] - 1) & terminated[:, None]
-    if retold is not None:
-        is_retold, retell = retold
-        seen, solved = retell(jnp.concatenate([observations[:, None], next_observations], axis=1))
-        observations = jnp.where(is_retold[:, None], seen[:, 0], observations)
-        next_observations = jnp.where(is_retold[:, None, None], seen[:, 1:], next_observations)
-        solved &= is_retold[:, None]
-        reached |= solved
-        ends |= solved  # whatever terminate_on_relabel says: no row begins in a solved state, so its value is never learnt
-        relabelled |= is_retold
-    rewards = jnp.where(relabelled[:, None], reached.astype(jnp.float32), rewards)
-    if config.terminate_on_relabel:
-        ends |= reached
+    ends = told.ends | (told.is_last if config.timeouts_are_terminal else told.is_last & told.terminated[:, None])
     ended_before = jnp.cumsum(ends, axis=1) - ends > 0
-    counted = inside & ~ended_before
+    counted = told.inside & ~ended_before
     num_steps = jnp.sum(counted, axis=1)  # (B,), at least 1
-    discounts = config.gamma ** jnp.arange(n_step, dtype=jnp.float32)
+    discounts = config.gamma ** jnp.arange(ends.shape[1], dtype=jnp.float32)
     last = (num_steps - 1)[:, None]
     return Transition(
-        observation=observations,
-        action=episodes.actions[rows, steps],
-        reward=jnp.sum(jnp.where(counted, rewards * discounts[None], 0.0), axis=1),
+        observation=told.observation,
+        action=episodes.actions[told.rows, told.steps],
+        reward=jnp.sum(jnp.where(counted, told.rewards * discounts[None], 0.0), axis=1),
         discount=jnp.where(jnp.take_along_axis(ends, last, axis=1)[:, 0], 0.0, config.gamma**num_steps),
-        next_observation=jnp.take_along_axis(next_observations, last[..., None], axis=1)[:, 0],
-        desired_goal=jnp.where(relabelled[:, None], new_goals, episodes.desired_goals[rows]),
-        is_demonstration=jnp.full(rows.shape, is_demonstration),
-        is_relabelled=relabelled,
-        obtained_return=_obtained_return(episodes, rows, steps, relabelled, config) if config.bound_by_obtained_return else None,
+        next_observation=jnp.take_along_axis(told.next_observations, last[..., None], axis=1)[:, 0],
+        desired_goal=desired_goals,
+        is_demonstration=jnp.full(told.rows.shape, is_demonstration),
+        is_relabelled=by_hindsight,
+        obtained_return=_obtained_return(episodes, told, by_hindsight, config) if config.bound_by_obtained_return else None,
     )
 
 
-def _obtained_return(episodes: Episodes, rows: Array, steps: Array, relabelled: Array, config: BatchConfig) -> Array:
-    """(B,) discounted reward at the end of each row's own episode, seen from its step; 0 for relabelled rows."""
-    last = episodes.lengths[rows] - 1
-    reward = episodes.rewards[rows, last] * config.gamma ** (last - steps).astype(jnp.float32)
-    return jnp.where(relabelled, 0.0, reward)
+def _obtained_return(episodes: Episodes, told: Steps, by_hindsight: Array, config: BatchConfig) -> Array:
+    """(B,) discounted reward at the end of each row's own episode, seen from its step; 0 for rows told by hindsight."""
+    last = episodes.lengths[told.rows] - 1
+    reward = episodes.rewards[told.rows, last] * config.gamma ** (last - told.steps).astype(jnp.float32)
+    return jnp.where(by_hindsight, 0.0, reward)
 
 
 def num_demo_rows(env_steps: Array, config: BatchConfig) -> Array:
@@ -336,51 +357,31 @@ def _replay_rows(
     retelling: Retelling | None,
 ) -> Transition:
     """Reads rows of the replay, those that are to be `relabelled` (B,) with goals of the config's sources as far as there are any, or retold."""
-    desired_goals = new_goals = replay.episodes.desired_goals[rows]
-    judged_by_goal, retold = replay.judged_by_goal[rows], None
+    told = read_steps(replay.episodes, rows, steps, config.n_step)
+    goals, judged_by_goal = replay.episodes.desired_goals[rows], replay.judged_by_goal[rows]
     if config.sources and retelling is not None:
         key, key_telling = jax.random.split(key)
         keys = jax.random.split(key_telling, rows.shape[0])
         subgoals = _new_subgoals(key, replay, rows, steps, table, num_subgoals=retelling.num_subgoals, config=config)
-        retold = relabelled, lambda observations: jax.vmap(retelling.retell)(keys, observations, subgoals)
+        told = retell(told, relabelled, lambda observations: jax.vmap(retelling.retell)(keys, observations, subgoals))
         judged_by_goal &= ~relabelled
     elif config.sources:
         new_goals, found = _new_goals(key, replay, rows, steps, table, achieved_goal=achieved_goal, config=config)
         relabelled &= found
+        goals = jnp.where(relabelled[:, None], new_goals, goals)
         judged_by_goal |= relabelled
     # A row of an episode that is judged by its behavioural goal is read as if that were a goal chosen in hindsight.
-    batch = transitions(
-        replay.episodes,
-        rows,
-        steps,
-        achieved_goal=achieved_goal,
-        new_goals=jnp.where(relabelled[:, None], new_goals, desired_goals),
-        relabelled=judged_by_goal,
-        epsilon=epsilon,
-        is_demonstration=False,
-        n_step=config.n_step,
-        config=config,
-        retold=retold,
-    )
+    told = judge_by_goals(told, judged_by_goal, goals, achieved_goal=achieved_goal, epsilon=epsilon, config=config)
+    batch = transitions(replay.episodes, told, goals, by_hindsight=judged_by_goal | relabelled, is_demonstration=False, config=config)
     return batch.replace(is_relabelled=relabelled)
 
 
-def demonstration_rows(
-    demonstrations: Episodes, rows: Array, steps: Array, *, achieved_goal: Callable[[Array], Array], epsilon: Array, config: BatchConfig
-) -> Transition:
+def demonstration_rows(demonstrations: Episodes, rows: Array, steps: Array, config: BatchConfig) -> Transition:
     """Reads rows of the demonstrations, which are never relabelled: rows and steps (B,) int32 -> the batch."""
-    return transitions(
-        demonstrations,
-        rows,
-        steps,
-        achieved_goal=achieved_goal,
-        new_goals=demonstrations.desired_goals[rows],
-        relabelled=jnp.zeros(rows.shape, bool),
-        epsilon=epsilon,
-        is_demonstration=True,
-        n_step=demonstrations.rewards.shape[1] if config.demo_returns == "monte_carlo" else config.n_step,
-        config=config,
-    )
+    n_step = demonstrations.rewards.shape[1] if config.demo_returns == "monte_carlo" else config.n_step
+    lived = read_steps(demonstrations, rows, steps, n_step)
+    never = jnp.zeros(rows.shape, bool)
+    return transitions(demonstrations, lived, demonstrations.desired_goals[rows], by_hindsight=never, is_demonstration=True, config=config)
 
 
 def sample_batch(
@@ -416,17 +417,18 @@ def sample_batch(
     """
     key_demo, key_demo_step, key_episode, key_step, key_goal = jax.random.split(key, 5)
     size, num_demos = config.batch_size, demonstrations.lengths.shape[0]
-    read: dict[str, Any] = dict(achieved_goal=achieved_goal, epsilon=epsilon, config=config)
     rows = sample_episodes(key_episode, replay, size)
     steps = sample_steps(key_step, replay.episodes, rows)
     index = jnp.arange(size)
     relabelled = (index >= demo_rows) & (index < demo_rows + _num_relabelled(size - demo_rows, config))
-    batch = _replay_rows(key_goal, replay, rows, steps, relabelled, table, retelling=retelling, **read)
+    batch = _replay_rows(
+        key_goal, replay, rows, steps, relabelled, table, achieved_goal=achieved_goal, epsilon=epsilon, config=config, retelling=retelling
+    )
     if config.max_demo_rows == 0:
         return batch
 
     demo = uniform_index(key_demo, (config.max_demo_rows,), num_demos)
-    demo_batch = demonstration_rows(demonstrations, demo, sample_steps(key_demo_step, demonstrations, demo), **read)
+    demo_batch = demonstration_rows(demonstrations, demo, sample_steps(key_demo_step, demonstrations, demo), config)
     head = jax.tree.map(lambda leaf: leaf[: config.max_demo_rows], batch)
     head = tree_where(index[: config.max_demo_rows] < demo_rows, demo_batch, head)
     return jax.tree.map(lambda leaf, first: leaf.at[: config.max_demo_rows].set(first), batch, head)
@@ -453,12 +455,13 @@ def sample_prioritised_batch(
       A batch of `config.batch_size` rows in no particular order, with weights, and where its rows come from.
     """
     key_draw, key_goal = jax.random.split(key)
-    read: dict[str, Any] = dict(achieved_goal=achieved_goal, epsilon=epsilon, config=config)
     drawn = prioritised.draw(key_draw, replay.priorities, config.batch_size)
     # How many rows come from where is not known when this is compiled, so each is read from both tables, and one reading thrown away.
     replayed = ~drawn.is_demonstration
     relabelled = replayed & (jnp.cumsum(replayed) <= _num_relabelled(jnp.sum(replayed), config))  # the first of them: all are drawn alike
-    from_replay = _replay_rows(key_goal, replay, drawn.rows, drawn.steps, relabelled, table, retelling=retelling, **read)
-    from_demonstrations = demonstration_rows(demonstrations, drawn.rows, drawn.steps, **read)
+    from_replay = _replay_rows(
+        key_goal, replay, drawn.rows, drawn.steps, relabelled, table, achieved_goal=achieved_goal, epsilon=epsilon, config=config, retelling=retelling
+    )
+    from_demonstrations = demonstration_rows(demonstrations, drawn.rows, drawn.steps, config)
     batch = tree_where(replayed, from_replay, from_demonstrations)
     return batch.replace(weight=prioritised.importance_weights(drawn, config)), drawn

@@ -212,7 +212,10 @@ def _interact(key: Array, state: TrainState, data: Guidance, env: Environment, c
     before = state.rollout
     action = act(key_act, before.observation, before.desired_goal)
     restarted = _new_episodes(key_reset, data, env, config, _progress(state, config))
-    after, time_step = rollout.step(before, restarted, action, env)
+    cut = None
+    if config.random_truncation > 0.0:
+        cut = jax.random.bernoulli(jax.random.fold_in(key, 4), config.random_truncation, (config.num_envs,))  # 4: split has used what 0 to 3 give
+    after, time_step = rollout.step(before, restarted, action, env, cut=cut)
     return remember(key_goals, key_nearby, state, action, time_step, after, data, env, config)
 
 
@@ -362,13 +365,12 @@ def _with_new_priorities(
     return state.replace(replay=state.replay.replace(priorities=renewed))
 
 
-def _demonstration_batch(key: Array, data: Guidance, env: Environment, config: TrainConfig) -> Transition:
+def _demonstration_batch(key: Array, data: Guidance, config: TrainConfig) -> Transition:
     """A batch of demonstration rows alone."""
     key_demo, key_step = jax.random.split(key)
     rows = uniform_index(key_demo, (config.batch.batch_size,), data.demonstrations.lengths.shape[0])
     steps = replay.sample_steps(key_step, data.demonstrations, rows)
-    read: dict[str, Any] = dict(achieved_goal=env.achieved_goal, epsilon=data.epsilon, config=config.batch)
-    return replay.demonstration_rows(data.demonstrations, rows, steps, **read)
+    return replay.demonstration_rows(data.demonstrations, rows, steps, config.batch)
 
 
 def clone(state: TrainState, data: Guidance, *, env: Environment, config: TrainConfig, num_iterations: int) -> tuple[TrainState, Metrics]:
@@ -376,7 +378,7 @@ def clone(state: TrainState, data: Guidance, *, env: Environment, config: TrainC
 
     def gradient_step(state: TrainState, _: None) -> tuple[TrainState, Metrics]:
         key, key_batch = jax.random.split(state.key)
-        batch = _demonstration_batch(key_batch, data, env, config)
+        batch = _demonstration_batch(key_batch, data, config)
         inputs = _network_inputs(batch, data.scale, env, config)["inputs"]
         progress = jnp.minimum(state.updates / config.steps, 1.0) if config.algo == "bc" else 0.0
         schedule = agents.schedule(progress, state.updates, config.agent, action_dim=env.action_dim)
@@ -392,7 +394,7 @@ def pretrain(state: TrainState, data: Guidance, *, env: Environment, config: Tra
 
     def gradient_step(state: TrainState, _: None) -> tuple[TrainState, None]:
         key, key_batch, key_update = jax.random.split(state.key, 3)
-        batch = _demonstration_batch(key_batch, data, env, config)
+        batch = _demonstration_batch(key_batch, data, config)
         batches = jax.tree.map(lambda leaf: leaf[None], batch)
         return _gradient_steps(key_update, state.replace(key=key), batches, data, env, config)[0], None
 

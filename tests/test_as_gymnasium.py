@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode
 import hindrl_jax as hindrl
 from experts.grid import GridExpert
 from experts.reach import ReachExpert
+from hindrl_jax.as_gymnasium import GoalVectorEnv
 from hindrl_jax.errors import UserError
 from hindrl_jax.registration import MAX_EPISODE_STEPS, gymnasium_id
 from hindrl_jax.registry import TASKS
@@ -59,6 +60,23 @@ def test_the_expert_is_rewarded_where_and_only_where_compute_reward_says_so(name
     assert terminated
 
 
+@pytest.mark.parametrize("name", TASKS)
+def test_a_continuing_task_rewards_each_step_at_the_goal(name):
+    env = gymnasium.make(gymnasium_id(name), max_episode_steps=400, continuing_task=True)
+    task, expert = env.unwrapped._task.env, EXPERTS[TASKS[name].family]
+    act = jax.jit(lambda seed, state: action_from_env(expert.act(jax.random.key(seed), task, state), task))
+    env.reset(seed=3)
+    rewards, truncated = [], False
+    while not truncated:
+        action = np.asarray(act(len(rewards), env.unwrapped._state)) if not any(rewards) else np.zeros(task.action_dim, np.float32)
+        observation, reward, terminated, truncated, info = env.step(action)
+        assert not terminated
+        assert reward == info["is_success"] == env.unwrapped.compute_reward(observation["achieved_goal"], observation["desired_goal"], {})
+        rewards.append(reward)
+    assert len(rewards) == 400
+    assert 0 < sum(rewards) < 400
+
+
 def test_rewards_are_those_of_goals_within_the_tolerance():
     env = gymnasium.make("hindrl/FixedParameterizedReach-v0").unwrapped
     goal = env.observation_space["desired_goal"].sample()
@@ -96,6 +114,32 @@ def test_side_by_side_they_live_the_episodes_of_single_ones(mode):
     assert num_ended == (6 if mode == "NextStep" else 9)  # a new episode takes a step, or none
     assert_same(together.reset(), apart.reset())
     assert_same(together.reset(seed=[5, 2, 9]), apart.reset(seed=[5, 2, 9]))
+
+
+# The agent starts at (0, 0), the only object lies at (1, 0), and the goal is (0, 1).
+TINY = dict(num_objects=1, size=2, random_box_size=1)
+SOLUTION = np.array([[1, -1, -1, -1, -1], [-1, 1, -1, -1, 1], [-1, -1, 1, -1, 1], [-1, -1, 1, -1, 1]], np.float32)  # the last one stays at the goal
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+@pytest.mark.parametrize("continuing_task", [False, True])
+@pytest.mark.parametrize("max_episode_steps", [3, 4])  # with 3 the step that solves the task is the last one
+def test_side_by_side_they_solve_the_episodes_of_single_ones(mode, continuing_task, max_episode_steps):
+    task = dict(max_episode_steps=max_episode_steps, continuing_task=continuing_task, **TINY)
+    together = gymnasium.make_vec(GRID, 2, autoreset_mode=mode, **task)
+    apart = gymnasium.make_vec(GRID, 2, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, **task)
+    assert_same(together.reset(seed=7), apart.reset(seed=7))
+    step, begins, rewards = 0, False, []
+    for _ in range(13):
+        actions = np.stack(2 * [SOLUTION[step]])
+        results = together.step(actions)
+        assert_same(results, apart.step(actions))
+        rewards.append(results[1][0])
+        ended = bool((results[2] | results[3])[0])
+        step = 0 if ended or begins else step + 1
+        begins = ended and mode == "NextStep"
+    one_episode = [0.0, 0.0, 1.0] + (max_episode_steps == 4 and continuing_task) * [1.0] + (mode == "NextStep") * [0.0]
+    assert rewards == (5 * one_episode)[:13]
 
 
 def assert_same(a, b):
@@ -136,6 +180,17 @@ def test_a_solved_episode_gives_way_to_the_next():
     np.testing.assert_array_equal(results[3][0]["observation"], [[1, 0, 0, 1, 0, 0]])  # begun anew; its action was not taken
 
 
+def test_a_continuing_task_is_cut_by_the_horizon_alone():
+    task = dict(num_objects=1, size=2, random_box_size=1)  # as above
+    env = gymnasium.make_vec(GRID, 1, max_episode_steps=4, continuing_task=True, **task)
+    env.reset(seed=0)
+    down_grabbing, left_grabbing, stay = [-1, 1, -1, -1, 1], [-1, -1, 1, -1, 1], [-1, -1, 1, -1, 1]
+    results = [env.step(np.array([action], np.float32)) for action in ([1, -1, -1, -1, -1], down_grabbing, left_grabbing, stay)]
+    assert [float(reward[0]) for _, reward, *_ in results] == [0.0, 0.0, 1.0, 1.0]
+    assert [bool(info["is_success"][0]) for *_, info in results] == [False, False, True, True]
+    assert [(bool(terminated[0]), bool(truncated[0])) for _, _, terminated, truncated, _ in results] == 3 * [(False, False)] + [(False, True)]
+
+
 def test_the_horizon_truncates_and_does_not_terminate():
     env = gymnasium.make(GRID, max_episode_steps=3)
     env.reset(seed=0)
@@ -163,12 +218,26 @@ def test_pictures_show_the_present_state():
         ("FixedGridPickAndPlace", {"num_objectss": 3}, "did you mean 'num_objects'"),
         ("FixedParameterizedReach", {"backend": "robosuite"}, "closed_form"),
         ("FixedParameterizedReach", {"orientation": "axis_angle"}, "compute_reward cannot be had"),
+        ("FixedGridPickAndPlace", {"continuing_task": "false"}, "continuing_task = 'false' is not usable"),
     ],
 )
 def test_what_cannot_be_is_refused(name, arguments, message):
     for make in (gymnasium.make, gymnasium.make_vec):
         with pytest.raises(UserError, match=message):
             make(gymnasium_id(name), **arguments)
+
+
+@pytest.mark.parametrize("steps", [0, -2, 2.5])
+def test_a_vector_environment_refuses_a_horizon_that_is_none(steps):
+    with pytest.raises(UserError, match=r"max_episode_steps = .* is not usable"):
+        GoalVectorEnv("FixedGridPickAndPlace", max_episode_steps=steps)
+
+
+def test_a_vector_environment_may_have_no_horizon():
+    for steps in (None, -1):
+        env = GoalVectorEnv("FixedGridPickAndPlace", max_episode_steps=steps)
+        env.reset(seed=0)
+        assert not any(env.step(action)[3].any() for action in random_actions(env, 5))
 
 
 def test_seeds_must_be_as_many_as_environments():

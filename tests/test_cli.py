@@ -9,6 +9,7 @@ import re
 import shlex
 import subprocess
 import sys
+import time
 import warnings
 from pathlib import Path
 
@@ -46,6 +47,33 @@ def demos_file(tmp_path):
     path = tmp_path / "demos.hdf5"
     cli.main(["demos", "record", "--env", "FixedGridPickAndPlace", "--demos", "2", "--out", str(path)])
     return path
+
+
+class Forgetful:
+    """What it raises when it is deleted is not seen by anyone."""
+
+    def __del__(self):
+        raise KeyboardInterrupt
+
+
+def test_an_interrupt_that_nobody_saw_comes_again(monkeypatch, capsys):
+    def forget(arguments):
+        Forgetful()
+        time.sleep(20)
+
+    monkeypatch.setitem(cli.COMMANDS, "envs", forget)
+    started = time.monotonic()
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["envs"])
+    assert stop.value.code == 130
+    assert time.monotonic() - started < 10  # it wakes what waits
+    assert capsys.readouterr().err == "hindrl: interrupted\n"
+
+
+def test_an_interrupt_does_not_outlive_its_command(monkeypatch):
+    monkeypatch.setitem(cli.COMMANDS, "envs", lambda arguments: Forgetful() and None)
+    cli.main(["envs"])
+    time.sleep(0.3)
 
 
 def test_options_that_change_nothing_are_warned_about():

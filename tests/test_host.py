@@ -183,7 +183,8 @@ def test_what_cannot_be_had_is_refused(env, demonstrations):
     own = hindrl.make("FixedGridPickAndPlace")
     for where, config, message in [
         (env, dataclasses.replace(CONFIG, demo_reset_ratio=0.5), "whose states are not known"),
-        (env, dataclasses.replace(CONFIG, agent_resets=(0.5,)), "is for environments in JAX"),
+        (env, dataclasses.replace(CONFIG, random_truncation=0.1), r"random_truncation = 0\.1 is for environments in JAX"),
+        (env, dataclasses.replace(CONFIG, agent_resets=(0.5,)), "agent_resets = .* is for environments in JAX"),
         (env, dataclasses.replace(CONFIG, goal=dataclasses.replace(CONFIG.goal, behavioural_goals="task")), "choose environment"),
         (own, CONFIG, "gives its episodes no goals"),
     ]:

@@ -27,7 +27,7 @@ def test_one_demonstration_solves_the_fixed_reach_task():
     demonstrations = [hindrl.record_demonstrations(env, 1, seed=seed) for seed in seeds]
     result = hindrl.fit(env, demonstrations, hindrl.preset("hindrl", env=env), seeds=seeds)
     assert all(summary.best_success >= 0.95 for summary in result.summaries())
-    assert (result.final_success >= 0.5).all(), result.final_success  # a policy that has learned dips now and then, and recovers
+    assert (result.final_success >= 0.9).all(), result.final_success
     assert (result.final_length <= 220).all(), result.final_length  # the best possible is about 165, the demonstrations' 290
 
 

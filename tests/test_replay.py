@@ -20,7 +20,17 @@ from hindrl_jax import priorities as prioritised
 from hindrl_jax import replay as replays
 from hindrl_jax.config import BatchConfig
 from hindrl_jax.goals import GoalTable
-from hindrl_jax.replay import num_demo_rows, sample_batch, sample_episodes, sample_prioritised_batch, sample_steps, transitions
+from hindrl_jax.replay import (
+    demonstration_rows,
+    judge_by_goals,
+    num_demo_rows,
+    read_steps,
+    sample_batch,
+    sample_episodes,
+    sample_prioritised_batch,
+    sample_steps,
+    transitions,
+)
 from hindrl_jax.types import Episodes
 
 NUM_ENVS, HORIZON, SLOTS = 2, 3, 4
@@ -337,9 +347,10 @@ def test_a_retold_row_is_about_states_of_its_source_in_their_order(strategy, rul
     assert {"task_conditioned": foreign == 1.0, "joint_union": 0.0 < foreign < 1.0}.get(strategy, foreign == 0.0)
 
 
-@functools.partial(jax.jit, static_argnames="config", compiler_options=FAST_COMPILATION)
-def draw_prioritised_batch(key, replay, config):
-    return sample_prioritised_batch(key, replay, demonstrations(), TABLE, achieved_goal=identity, epsilon=jnp.zeros(3), config=config)
+@functools.partial(jax.jit, static_argnames=("config", "retelling"), compiler_options=FAST_COMPILATION)
+def draw_prioritised_batch(key, replay, config, retelling=None):
+    given = dict(achieved_goal=identity, epsilon=jnp.zeros(3), config=config, retelling=retelling)
+    return sample_prioritised_batch(key, replay, demonstrations(), TABLE, **given)
 
 
 def with_random_priorities(replay, seed):
@@ -413,6 +424,18 @@ def test_every_row_of_a_prioritised_batch_comes_from_where_it_says(strategy):
             assert priorities[*place] == drawn.priority[row]
 
 
+def test_a_prioritised_batch_retells_the_first_of_its_replayed_rows():
+    history, _ = replay_history([[3, 2], [1, 3]])
+    config = dataclasses.replace(BATCH, priority_exponent=0.5, hindrl_sampling_strategy="future")
+    replay = with_random_priorities(at(history, 17), 0)
+    batch, _ = jax.device_get(draw_prioritised_batch(jax.random.key(0), replay, config, replays.Retelling(tell, 2)))
+    replayed = np.flatnonzero(~batch.is_demonstration)
+    retold = replayed[: len(replayed) * 3 // 4]
+    assert 0 < len(retold) < len(replayed) < 64
+    assert np.flatnonzero(batch.is_relabelled).tolist() == retold.tolist()
+    assert np.flatnonzero(batch.observation[:, 0] > 9).tolist() == retold.tolist()  # where a story was written
+
+
 def test_union_draws_from_both_sources_and_relabelling_can_be_off():
     history, _ = replay_history([[3], [3]])
     config = dataclasses.replace(BATCH, hindrl_sampling_strategy="joint_union")
@@ -484,18 +507,10 @@ def test_episodes_judged_by_their_goal_are_rewarded_for_reaching_it(n_step):
 
 def test_jitted_equals_not_jitted():
     def read(episodes, rows, steps, goals):
-        return transitions(
-            episodes,
-            rows,
-            steps,
-            achieved_goal=identity,
-            new_goals=goals,
-            relabelled=goals[:, 2] < 2,
-            epsilon=jnp.zeros(3),
-            is_demonstration=False,
-            n_step=BATCH.n_step,
-            config=BATCH,
-        )
+        chosen = goals[:, 2] < 2
+        told = read_steps(episodes, rows, steps, BATCH.n_step)
+        told = judge_by_goals(told, chosen, goals, achieved_goal=identity, epsilon=jnp.zeros(3), config=BATCH)
+        return transitions(episodes, told, goals, by_hindsight=chosen, is_demonstration=False, config=BATCH)
 
     arguments = (demonstrations(), jnp.array([0, 2, 2, 1]), jnp.array([1, 0, 1, 0]), jnp.array([[DEMO, 2.0, t] for t in range(4)]))
     jax.tree.map(np.testing.assert_array_equal, jax.jit(read)(*arguments), read(*arguments))
@@ -607,19 +622,13 @@ def test_transitions_are_those_of_a_plain_loop(lengths, places, terminated, chos
     steps = np.array([step % lengths[row] for row, step, _, _ in chosen], np.int32)
     goals = np.array([[goal] for _, _, goal, _ in chosen], np.float32)
     relabelled = np.array([flag for _, _, _, flag in chosen])
-    batch = transitions(
-        jax.tree.map(jnp.asarray, episodes),
-        jnp.asarray(rows),
-        jnp.asarray(steps),
-        achieved_goal=lambda observation: observation[..., 2:],
-        new_goals=jnp.asarray(goals),
-        relabelled=jnp.asarray(relabelled),
-        epsilon=jnp.array([epsilon]),
-        is_demonstration=is_demonstration,
-        n_step=config.n_step,
-        config=config,
+    table, chosen = jax.tree.map(jnp.asarray, episodes), jnp.asarray(relabelled)
+    told = read_steps(table, jnp.asarray(rows), jnp.asarray(steps), config.n_step)
+    told = judge_by_goals(
+        told, chosen, jnp.asarray(goals), achieved_goal=lambda observation: observation[..., 2:], epsilon=jnp.array([epsilon]), config=config
     )
-    batch = jax.device_get(batch)
+    desired = jnp.where(chosen[:, None], goals, table.desired_goals[rows])
+    batch = jax.device_get(transitions(table, told, desired, by_hindsight=chosen, is_demonstration=is_demonstration, config=config))
     for i in range(ROWS):
         reward, discount, following, goal = transition_twin(
             episodes, rows[i], steps[i], goals[i, 0], relabelled=relabelled[i], epsilon=epsilon, config=config
@@ -642,18 +651,8 @@ def test_last_row_of_a_solved_demonstration_is_worth_one_and_ends():
         rewards[i, length - 1] = 1.0
     table = demonstrations().replace(rewards=jnp.asarray(rewards), terminated=jnp.ones(3, bool))
     rows, steps = zip(*[(i, t) for i, length in enumerate(DEMO_LENGTHS) for t in range(length)], strict=True)
-    batch = transitions(
-        table,
-        jnp.array(rows),
-        jnp.array(steps),
-        achieved_goal=identity,
-        new_goals=jnp.zeros((6, 3)),
-        relabelled=jnp.zeros(6, bool),
-        epsilon=jnp.zeros(3),
-        is_demonstration=True,
-        n_step=1,
-        config=BatchConfig(gamma=0.5, bound_by_obtained_return=True),
-    )
+    config = BatchConfig(gamma=0.5, n_step=1, bound_by_obtained_return=True)
+    batch = demonstration_rows(table, jnp.array(rows), jnp.array(steps), config)
     assert batch.reward.tolist() == [0, 0, 1, 1, 0, 1]
     assert batch.discount.tolist() == [0.5, 0.5, 0, 0, 0.5, 0]
     assert batch.obtained_return.tolist() == [0.25, 0.5, 1, 1, 0.5, 1]  # lengths 3, 1 and 2

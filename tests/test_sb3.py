@@ -21,7 +21,7 @@ def test_stable_baselines_finds_no_fault(name):
 
 def test_tqc_with_her_trains():
     torch.set_num_threads(1)  # more of them wait for one another where the cores have other work
-    flags = "--env hindrl/FixedGridPickAndPlace-v0 --set num_objects=1 size=4 --num-envs 2 --steps 640 --eval-every 320 --eval-episodes 4"
+    flags = "--num-envs 2 --steps 640 --eval-every 320 --eval-episodes 4"
     success = sb3_her_tqc.train(sb3_her_tqc.parse(flags.split()))
     assert len(success) == 2
     assert all(0.0 <= rate <= 1.0 for rate in success)

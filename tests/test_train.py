@@ -423,6 +423,24 @@ def test_training_episodes_may_begin_in_demonstrated_states_and_evaluations_neve
     assert evaluation.length.tolist() == [5] * 20  # from 0, velocity 1 passes 4 in the fifth step
 
 
+def test_training_episodes_are_cut_at_random_and_evaluations_never_are(data):
+    env, config = make_env(), make_config(random_truncation=0.5)
+
+    @functools.partial(jax.jit, compiler_options=FAST_COMPILATION)
+    def run(key):
+        key_init, key_evaluate = jax.random.split(key)
+        state = train.init(key_init, data, env, config)
+        state = with_output_bias(train.collect(state, data, env=env, config=config, num_iterations=60), [0.0, 0.0, 0.0, 0.0])
+        return state.replay, train.evaluate(key_evaluate, state.agent.actor, data, env=env, config=config, num_episodes=20)
+
+    replay, evaluation = jax.device_get(run(jax.random.key(0)))
+    complete = replay.episodes.lengths > 0
+    lengths = replay.episodes.lengths[complete & ~replay.episodes.terminated]
+    assert lengths.size > 20
+    assert 1.0 < lengths.mean() < 3.0  # 2 steps, if none were cut by the horizon
+    assert evaluation.length.tolist() == [5] * 20
+
+
 def test_a_reverse_curriculum_widens_from_the_end_of_the_demonstrations():
     # Demonstrations of 5, 4 and 5 steps. The curriculum lasts for half of the 1,200 steps; each of the 3 environments takes 400 of them.
     env = make_env()
@@ -557,7 +575,7 @@ def test_warm_start_clones_and_pretraining_teaches_the_critics_before_any_mixed_
 @pytest.mark.parametrize("returns", ["n_step", "monte_carlo"])
 def test_pretraining_sees_the_returns_that_are_asked_for(data, returns):
     config = make_config(batch=BatchConfig(batch_size=64, n_step=1, demo_returns=returns))
-    batch = train._demonstration_batch(jax.random.key(0), data, make_env(), config)
+    batch = train._demonstration_batch(jax.random.key(0), data, config)
     assert batch.is_demonstration.all()
     assert set((np.asarray(batch.discount) > 0).tolist()) == ({False} if returns == "monte_carlo" else {False, True})
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import signal
 import sys
+import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +76,33 @@ def _set_up_jax() -> None:
         jax.config.update("jax_num_cpu_devices", cores or 1)
 
 
+@contextlib.contextmanager
+def _interrupts_that_last() -> Iterator[None]:
+    """A Ctrl-C that falls into a callback of the interpreter, of which JAX has one for garbage collection, is forgotten there: it is sent again."""
+    hook, timers, main_thread = sys.unraisablehook, [], threading.main_thread().ident
+
+    def send() -> None:
+        if main_thread is not None and hasattr(signal, "pthread_kill"):
+            signal.pthread_kill(main_thread, signal.SIGINT)  # unlike raise_signal, it wakes what waits
+        else:
+            signal.raise_signal(signal.SIGINT)
+
+    def send_again(unraisable: Any) -> None:
+        if not issubclass(unraisable.exc_type, KeyboardInterrupt):
+            return hook(unraisable)
+        timers.append(threading.Timer(0.1, send))
+        timers[-1].daemon = True
+        timers[-1].start()
+
+    sys.unraisablehook = send_again
+    try:
+        yield
+    finally:
+        sys.unraisablehook = hook
+        for timer in timers:
+            timer.cancel()
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the `hindrl` command; with arguments given, runs within this process as it is."""
     if arguments is None:
@@ -83,7 +113,7 @@ def main(arguments: list[str] | None = None) -> None:
         if last in ("--help", "-h") and (not group or (len(group) == 1 and isinstance(COMMANDS.get(group[0]), dict))):
             print(_usage(), flush=True)
             return
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), _interrupts_that_last():
             warnings.showwarning = lambda message, *_, **__: print(f"hindrl: warning: {message}", file=sys.stderr)
             command, rest = _find(arguments)
             command(rest)

@@ -117,6 +117,7 @@ def test_six_d_is_continuous_where_rotation_vectors_jump():
     assert np.linalg.norm(to_vectors(matrices)[:50] - to_vectors(matrices)[50:], axis=1).min() > 6.0
     # It is the whole rotation: the third column follows.
     np.testing.assert_allclose(np.cross(found[:, :3], found[:, 3:]), matrices[:, :, 2], atol=1e-6)
+    np.testing.assert_allclose(jax.vmap(rotations.from_six_d)(found), matrices, atol=1e-6)
 
 
 def test_between_turns_the_source_into_the_target_in_the_axes_of_the_base():
