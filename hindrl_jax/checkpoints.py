@@ -12,12 +12,14 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import io
 import logging
 import os
 import shutil
+import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -181,10 +183,14 @@ class Checkpoints:
 
     @contextlib.contextmanager
     def _damage(self, path: Path) -> Iterator[None]:
+        hook = sys.unraisablehook
+        sys.unraisablehook = functools.partial(_report_unless_late, hook)
         try:
             yield
         except (OSError, ValueError, KeyError, TypeError) as error:  # what libraries say of bytes that make no sense
+            # The hook stays: of the arrays that were being read at the same time, some are done only now, and nobody waits for them.
             raise UserError(f"{path} is damaged ({one_line(error)[:200]}): remove it to begin again") from error
+        sys.unraisablehook = hook
 
 
 def _orbax() -> Any:
@@ -193,6 +199,12 @@ def _orbax() -> Any:
 
     logging.getLogger("absl").setLevel(logging.CRITICAL)
     return ocp
+
+
+def _report_unless_late(hook: Callable[[Any], object], unraisable: Any) -> None:
+    """Reports an exception that nobody can catch, but for that of an array read by Orbax after another one had failed."""
+    if str(unraisable.exc_value) != "Event loop is closed":
+        hook(unraisable)
 
 
 def _trees(result: Result) -> tuple[Any, ...]:

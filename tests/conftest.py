@@ -1,14 +1,18 @@
 """Strict settings for every test: no silent broadcasting between ranks, no random key consumed twice.
 
-Programs here are small and run for an instant, so nearly all of the time goes into compiling them: the compiler is told to take less trouble, in the
-processes that tests start, too.
+The programs of the fast tests are small and run for an instant, so the compiler is told to take little trouble over them, also in processes that
+tests start.
 """
 
 import os
-
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true".strip()
 
 import jax
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_debug_key_reuse", True)
+
+
+def pytest_configure(config):
+    if config.option.markexpr == "not slow":
+        quick = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {quick}".strip()  # read when JAX makes its first array

@@ -6,7 +6,6 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from toy_env import FAST_COMPILATION
 
 from hindrl_jax import agent as agents
 from hindrl_jax.config import AgentConfig
@@ -61,12 +60,12 @@ def inputs_of(observation, config):
     return agents.network_inputs(observation, zeros, zeros, UNIT_SCALE, config)
 
 
-@functools.partial(jax.jit, static_argnames="config", compiler_options=FAST_COMPILATION)
+@functools.partial(jax.jit, static_argnames="config")
 def fresh_agent(key, config=CONFIG):
     return agents.init(key, config, observation_dim=2, goal_dim=1, action_dim=1)
 
 
-@functools.partial(jax.jit, static_argnames="config", compiler_options=FAST_COMPILATION)
+@functools.partial(jax.jit, static_argnames="config")
 def updates(key, start, batch, config):
     given = dict(
         inputs=inputs_of(batch.observation, config),

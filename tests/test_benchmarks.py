@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toy_env import FAST_COMPILATION
 
 from benchmarks import reach_parity, reach_speed
 from benchmarks.timing import Effort, Options
@@ -48,7 +47,7 @@ def test_a_quick_benchmark_of_the_arm(tmp_path):
 
 @pytest.mark.parametrize(
     "contestant",
-    [lambda: reach_speed.arms(panda.control_step, 3, 2, FAST_COMPILATION), lambda: reach_speed.physics(3, 2, 2)],
+    [lambda: reach_speed.arms(panda.control_step, 3, 2, {}), lambda: reach_speed.physics(3, 2, 2)],
     ids=["closed form", "C MuJoCo"],
 )
 def test_arms_take_turns(contestant):

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -121,7 +122,7 @@ def assert_same(result, expected):
     assert [dataclasses.replace(row, seconds=0.0) for row in result.rows] == [dataclasses.replace(row, seconds=0.0) for row in expected.rows]
 
 
-@pytest.mark.parametrize("config", [CONFIG, PRIORITISED, CLONING], ids=["hindrl", "prioritised", "bc"])
+@pytest.mark.parametrize("config", [PRIORITISED, CLONING], ids=["prioritised", "bc"])  # hindrl is among the commands below
 def test_a_run_killed_again_and_again_ends_as_if_it_never_was(tmp_path, demonstrations, config):
     # Reports: 1 is before anything happened, then one for each chunk of 2 steps, so there are evaluations between and right before the kills.
     for at in (4, 12):
@@ -149,6 +150,20 @@ def test_a_damaged_checkpoint_is_one_line(stopped, begun, victim):
     (complete / victim).write_bytes(b"\0damaged")
     with pytest.raises(hindrl.UserError, match=r"is damaged .*: remove it to begin again"):
         Checkpoints(stopped).restore(begun)
+
+
+def test_what_answers_after_a_damaged_checkpoint_was_given_up_is_not_reported(stopped, begun, monkeypatch):
+    reported, late, another = [], *(SimpleNamespace(exc_value=RuntimeError(said)) for said in ("Event loop is closed", "something else"))
+    monkeypatch.setattr(sys, "unraisablehook", reported.append)
+    (complete,) = stopped.iterdir()
+    assert Checkpoints(stopped).restore(begun) is not None
+    assert sys.unraisablehook == reported.append
+    (complete / "arrays" / "manifest.ocdbt").write_bytes(b"damaged")
+    with pytest.raises(hindrl.UserError):
+        Checkpoints(stopped).restore(begun)
+    sys.unraisablehook(late)
+    sys.unraisablehook(another)
+    assert reported == [another]
 
 
 def test_another_experiment_is_refused_by_the_array_that_differs(stopped, begun):

@@ -273,6 +273,11 @@ def test_every_damaged_byte_of_an_archive_is_one_line(tmp_path):
         read(str(path), Interpretation(solved="all"))
 
 
+def test_demonstrations_that_count_as_solved_whole_are_not_cut():
+    with pytest.raises(UserError, match="cut = True needs solved to be 'dones' or 'reward'"):
+        Interpretation(solved="all", cut=True)
+
+
 @pytest.mark.parametrize(
     ("dones", "rewards", "solved", "expected"),
     [

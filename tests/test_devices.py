@@ -37,23 +37,21 @@ print(json.dumps({
 
 
 def with_devices(count):
-    quick = {"XLA_FLAGS": "--xla_backend_optimization_level=0", "JAX_ENABLE_COMPILATION_CACHE": "false"}  # tiny programs, compiled once
-    return os.environ | quick | {"JAX_NUM_CPU_DEVICES": str(count), "JAX_PLATFORMS": "cpu"}
+    return os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false", "JAX_NUM_CPU_DEVICES": str(count), "JAX_PLATFORMS": "cpu"}
 
 
-def test_two_and_eight_devices_give_what_one_gives():
+def test_eight_devices_give_what_one_gives():
     outputs = []
-    for count in (1, 2, 8):
+    for count in (1, 8):
         done = subprocess.run([sys.executable, "-c", TRAIN], env=with_devices(count), capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         outputs.append(json.loads(done.stdout))
-    one, *others = outputs
-    assert [output["devices"] for output in outputs] == [[1], [2], [8]]  # every leaf of the state lies on all of them
-    for several in others:
-        for expected, given in zip(one["metrics"], several["metrics"], strict=True):
-            for name, value in expected.items():
-                assert given[name] == pytest.approx(value, rel=1e-3, abs=1e-5), name
-        np.testing.assert_allclose(several["checksum"], one["checksum"], rtol=1e-3)
+    one, eight = outputs
+    assert (one["devices"], eight["devices"]) == ([1], [8])  # every leaf of the state lies on all of them
+    for expected, given in zip(one["metrics"], eight["metrics"], strict=True):
+        for name, value in expected.items():
+            assert given[name] == pytest.approx(value, rel=1e-3, abs=1e-5), name
+    np.testing.assert_allclose(eight["checksum"], one["checksum"], rtol=1e-3)
 
 
 def hindrl(*arguments, devices=1):

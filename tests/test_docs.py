@@ -9,10 +9,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from toy_env import FAST_COMPILATION
 
-from experts import recording
-from hindrl_jax import experiment, presets, runs
+from hindrl_jax import presets
 from hindrl_jax.from_gymnasium import GymnasiumEnv
 from hindrl_jax.types import Environment
 
@@ -81,7 +79,7 @@ def test_links_of_the_readme_lead_somewhere():
 
 @pytest.fixture
 def small(monkeypatch, tmp_path):
-    """Presets of hardly any steps, and programs that are compiled in a hurry."""
+    """Presets of hardly any steps."""
     full = presets.preset
 
     def preset(algo: str = "hindrl", name: str = "default", *, env: str | Environment = "FixedGridPickAndPlace"):
@@ -91,8 +89,6 @@ def small(monkeypatch, tmp_path):
         return dataclasses.replace(config, agent=agent, batch=batch, num_envs=2, learning_starts=200, steps=260, eval_every=40, eval_episodes=3)
 
     monkeypatch.setattr(presets, "preset", preset)
-    for module in (experiment, runs, recording):
-        monkeypatch.setattr(module, "compiler_options", lambda env: FAST_COMPILATION)
     monkeypatch.chdir(tmp_path)
 
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from PIL import Image
 from point_env import CONFIG, SPEED, to_goal
-from toy_env import FAST_COMPILATION
 
 import hindrl_jax as hindrl
 from hindrl_jax import cli
@@ -21,11 +20,7 @@ POINT = "gymnasium:point_env:PointGoal-v0"
 
 @pytest.fixture(scope="module")
 def env():
-    """Its programs are run for so short a time that compiling them well does not pay."""
-    env = hindrl.make(POINT)
-    type(env).compiler_options = FAST_COMPILATION
-    yield env
-    del type(env).compiler_options
+    return hindrl.make(POINT)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import linen as nn
-from toy_env import FAST_COMPILATION
 
 from hindrl_jax.config import AgentConfig
 from hindrl_jax.networks import LOG_STD_MAX, LOG_STD_MIN, ActionDistribution, apply_actor, apply_critics, init_actor, init_critics, mean_return
@@ -19,7 +18,7 @@ B, INPUT_DIM, ACTION_DIM = 4, 3, 2
 
 
 def jitted(init):
-    return jax.jit(lambda key: init(key, CONFIG, input_dim=INPUT_DIM, action_dim=ACTION_DIM), compiler_options=FAST_COMPILATION)
+    return jax.jit(lambda key: init(key, CONFIG, input_dim=INPUT_DIM, action_dim=ACTION_DIM))
 
 
 @pytest.fixture(scope="module")

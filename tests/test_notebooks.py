@@ -1,6 +1,5 @@
 """The notebooks run from top to bottom, at a small size."""
 
-import os
 from pathlib import Path
 
 import nbformat
@@ -20,9 +19,7 @@ NOTEBOOKS = {
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
 @pytest.mark.filterwarnings("default")  # Jupyter's own deprecations are not ours to mend
-def test_notebook_runs(name, monkeypatch):
-    # Most of the time goes into compilation, and hardly any into the programs.
-    monkeypatch.setenv("XLA_FLAGS", f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0")
+def test_notebook_runs(name):
     smaller, num_pictures, num_films = NOTEBOOKS[name]
     notebook = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
     for large, small in smaller.items():

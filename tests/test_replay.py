@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import strategies as st
-from toy_env import FAST_COMPILATION
 
 from hindrl_jax import priorities as prioritised
 from hindrl_jax import replay as replays
@@ -186,7 +185,7 @@ def test_steps_are_drawn_uniformly():
     assert np.abs(counts - 1000).max() < 130  # deviation 26
 
 
-@functools.partial(jax.jit, static_argnames="config", compiler_options=FAST_COMPILATION)
+@functools.partial(jax.jit, static_argnames="config")
 def draw_batch(key, replay, demo_rows, config):
     return sample_batch(key, replay, demonstrations(), TABLE, achieved_goal=identity, epsilon=jnp.zeros(3), demo_rows=demo_rows, config=config)
 
@@ -295,7 +294,7 @@ def tell(key, observations, subgoals):
     return told, observations[1:, 2] >= subgoals[1, 2]
 
 
-@functools.partial(jax.jit, static_argnames="config", compiler_options=FAST_COMPILATION)
+@functools.partial(jax.jit, static_argnames="config")
 def draw_retold_batch(key, replay, config):
     table = TABLE.replace(observations=TABLE.goals)
     given = dict(achieved_goal=identity, epsilon=jnp.zeros(3), demo_rows=jnp.asarray(NUM_DEMO), config=config)
@@ -347,7 +346,7 @@ def test_a_retold_row_is_about_states_of_its_source_in_their_order(strategy, rul
     assert {"task_conditioned": foreign == 1.0, "joint_union": 0.0 < foreign < 1.0}.get(strategy, foreign == 0.0)
 
 
-@functools.partial(jax.jit, static_argnames=("config", "retelling"), compiler_options=FAST_COMPILATION)
+@functools.partial(jax.jit, static_argnames=("config", "retelling"))
 def draw_prioritised_batch(key, replay, config, retelling=None):
     given = dict(achieved_goal=identity, epsilon=jnp.zeros(3), config=config, retelling=retelling)
     return sample_prioritised_batch(key, replay, demonstrations(), TABLE, **given)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toy_env import FAST_COMPILATION, Corridor, corridor_demonstrations
+from toy_env import Corridor, corridor_demonstrations
 
 from envs.grid import FixedGridPickAndPlace
 from hindrl_jax import replay as replays
@@ -28,7 +28,7 @@ STATIC = ("env", "config", "num_iterations", "num_episodes", "stochastic")
 
 def program(function, **options):
     names = [name for name in inspect.signature(function).parameters if name in STATIC]
-    return jax.jit(chex.assert_max_traces(function, n=1), static_argnames=names, compiler_options=FAST_COMPILATION, **options)
+    return jax.jit(chex.assert_max_traces(function, n=1), static_argnames=names, **options)
 
 
 init, collect, clone, evaluate = program(train.init), program(train.collect), program(train.clone), program(train.evaluate)
@@ -180,7 +180,7 @@ def two_seeds(data):
 def mapped(data):
     """`learn` over two seeds, compiled as the experiments do."""
     run = jax.vmap(functools.partial(train.learn, env=make_env(), config=make_config(), num_iterations=LEARN_STEPS))
-    return jax.jit(run, donate_argnums=0, compiler_options=FAST_COMPILATION).lower(*two_seeds(data)).compile()
+    return jax.jit(run, donate_argnums=0).lower(*two_seeds(data)).compile()
 
 
 def test_a_seed_alone_equals_its_row_under_vmap(mapped, data):
@@ -229,7 +229,7 @@ def test_prioritised_training_over_two_seeds():
     config = make_config(batch=PRIORITISED, goal=goal, agent=agent)
     data = train.guidance(corridor_demonstrations((1.0, 1.25, 0.9), env=env), env, config)
 
-    @functools.partial(jax.jit, compiler_options=FAST_COMPILATION)
+    @jax.jit
     @jax.vmap
     def start(seed):
         return train.collect(train.init(jax.random.key(seed), data, env, config), data, env=env, config=config, num_iterations=COLLECT_STEPS)
@@ -237,7 +237,7 @@ def test_prioritised_training_over_two_seeds():
     before = start(jnp.arange(2))
     former = jax.device_get(before.replay.priorities)
     learn = jax.vmap(functools.partial(train.learn, data=data, env=env, config=config, num_iterations=LEARN_STEPS))
-    learn = jax.jit(learn, donate_argnums=0, compiler_options=FAST_COMPILATION).lower(before).compile()
+    learn = jax.jit(learn, donate_argnums=0).lower(before).compile()
     state, metrics = learn(before)
     chex.assert_tree_all_finite((state.agent, metrics, state.replay.priorities))
 
@@ -277,7 +277,7 @@ def test_drawn_transitions_get_the_errors_of_their_own_rows():
         last = {"kernel": jnp.zeros_like(last["kernel"]), "bias": jnp.full_like(last["bias"], value)}
         return {"params": {**critics["params"], "Dense_1": last}}
 
-    @functools.partial(jax.jit, compiler_options=FAST_COMPILATION)
+    @jax.jit
     def run(key):
         key_init, key_draw, key_errors = jax.random.split(key, 3)
         state = train.collect(train.init(key_init, data, env, config), data, env=env, config=config, num_iterations=20)
@@ -402,7 +402,7 @@ def test_training_episodes_may_begin_in_demonstrated_states_and_evaluations_neve
     assert data.starts.lengths.sum() == 14
     assert data.demonstrations.states is None
 
-    @functools.partial(jax.jit, compiler_options=FAST_COMPILATION)
+    @jax.jit
     def run(key):
         key_init, key_evaluate = jax.random.split(key)
         state = train.init(key_init, data, env, config)
@@ -426,7 +426,7 @@ def test_training_episodes_may_begin_in_demonstrated_states_and_evaluations_neve
 def test_training_episodes_are_cut_at_random_and_evaluations_never_are(data):
     env, config = make_env(), make_config(random_truncation=0.5)
 
-    @functools.partial(jax.jit, compiler_options=FAST_COMPILATION)
+    @jax.jit
     def run(key):
         key_init, key_evaluate = jax.random.split(key)
         state = train.init(key_init, data, env, config)
@@ -448,7 +448,7 @@ def test_a_reverse_curriculum_widens_from_the_end_of_the_demonstrations():
     demonstrations = corridor_demonstrations((1.0, 1.25, 0.9), env=env)
     data = train.guidance(demonstrations, env, config)
 
-    @functools.partial(jax.jit, compiler_options=FAST_COMPILATION)
+    @jax.jit
     def begin(key, progress):
         return jax.vmap(lambda key: train._new_episodes(key, data, env, config, progress).observation)(jax.random.split(key, 300))
 
@@ -475,7 +475,7 @@ def test_achieved_goals_are_given_to_new_episodes_and_judge_them():
     env, config = make_env(), make_config(goal=ACHIEVED, batch=BatchConfig(batch_size=64, num_sampled_goals=0, n_step=1))
     data = train.guidance(corridor_demonstrations((1.0,), env=env), env, config)
 
-    @functools.partial(jax.jit, compiler_options=FAST_COMPILATION)
+    @jax.jit
     def run(key):
         key_init, key_batch = jax.random.split(key)
         state = train.collect(train.init(key_init, data, env, config), data, env=env, config=config, num_iterations=60)
@@ -510,7 +510,7 @@ def test_achieved_goals_cost_no_copy_of_the_replay(data):
     config = make_config(goal=GoalConfig(achieved_goal_ratio=0.5))
     state = jax.eval_shape(lambda key: train.init(key, data, make_env(), config), jax.random.key(0))
     run = functools.partial(train.learn, env=make_env(), config=config, num_iterations=LEARN_STEPS)
-    memory = jax.jit(run, donate_argnums=0, compiler_options=FAST_COMPILATION).lower(state, data).compile().memory_analysis()
+    memory = jax.jit(run, donate_argnums=0).lower(state, data).compile().memory_analysis()
     assert memory.temp_size_in_bytes < state.replay.episodes.actions.size * 4
 
 
@@ -519,7 +519,7 @@ def test_the_share_of_achieved_goals_moves_linearly():
     config = make_config(goal=goal, num_envs=500, buffer_size=500 * 2 * HORIZON, steps=10**6)
     data = train.guidance(corridor_demonstrations((1.0,), env=env), env, config)
 
-    @functools.partial(jax.jit, compiler_options=FAST_COMPILATION)
+    @jax.jit
     def judged(key):
         key_init, key_new, key_goals = jax.random.split(key, 3)
         state = train.collect(train.init(key_init, data, env, config), data, env=env, config=config, num_iterations=HORIZON)
@@ -543,7 +543,7 @@ def test_warm_start_clones_and_pretraining_teaches_the_critics_before_any_mixed_
     def after(**changes):
         config = make_config(agent=agent, batch=batch, **changes)
         start = train.init(jax.random.key(0), data, env, config)
-        return start, jax.jit(lambda state: train.pretrain(state, data, env=env, config=config), compiler_options=FAST_COMPILATION)(start)
+        return start, jax.jit(lambda state: train.pretrain(state, data, env=env, config=config))(start)
 
     start, warm = after(bc_warm_start=300)
     assert int(warm.updates) == 300
@@ -555,7 +555,7 @@ def test_warm_start_clones_and_pretraining_teaches_the_critics_before_any_mixed_
     td3 = dataclasses.replace(agent, base="td3", max_gradient_norm=1e-3)
     config = make_config(agent=td3, batch=batch, bc_warm_start=300)
     start = train.init(jax.random.key(0), data, env, config)
-    warm = jax.jit(lambda state: train.pretrain(state, data, env=env, config=config), compiler_options=FAST_COMPILATION)(start)
+    warm = jax.jit(lambda state: train.pretrain(state, data, env=env, config=config))(start)
     chex.assert_trees_all_close(warm.agent.target_actor, warm.agent.actor, atol=0.1)  # it has followed
     moved = jax.tree.map(lambda old, new: float(np.abs(old - new).max()), start.agent.target_actor, warm.agent.target_actor)
     assert max(jax.tree.leaves(moved)) > 0.1
@@ -682,7 +682,7 @@ def test_grid_runs_end_to_end():
         ),
     )
 
-    @functools.partial(jax.jit, compiler_options=FAST_COMPILATION)
+    @jax.jit
     def run(key):
         key_init, key_evaluate = jax.random.split(key)
         data = train.guidance(grid_demonstrations(env, 2), env, config)
@@ -714,7 +714,7 @@ def test_with_span_1_the_averaged_actor_is_the_mean_of_all_actors(data):
 def test_the_agent_begins_anew_once_and_the_replay_stays(data):
     """A reset halfway, at step 51: collecting takes 42 steps, each call of `learn` 9 more and 6 updates."""
     config = make_config(agent_resets=(0.5,))
-    run = jax.jit(functools.partial(train.learn, env=make_env(), config=config, num_iterations=LEARN_STEPS), compiler_options=FAST_COMPILATION)
+    run = jax.jit(functools.partial(train.learn, env=make_env(), config=config, num_iterations=LEARN_STEPS))
     steps, states = [], [collected(0, data)]
     for _ in range(3):
         state, _ = run(states[-1], data)

@@ -11,9 +11,6 @@ from flax import struct
 
 from hindrl_jax.types import Array, Episodes, TimeStep
 
-# Options of `jax.jit`: most of the time of the tests goes into compilation, and hardly any into the programs.
-FAST_COMPILATION = {"xla_backend_optimization_level": 0}
-
 
 @struct.dataclass(kw_only=True)
 class CorridorState:

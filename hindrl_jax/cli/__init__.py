@@ -98,7 +98,8 @@ def _interrupts_that_last() -> Iterator[None]:
     try:
         yield
     finally:
-        sys.unraisablehook = hook
+        if sys.unraisablehook is send_again:  # else somebody who needs it longer has put another before it
+            sys.unraisablehook = hook
         for timer in timers:
             timer.cancel()
 

@@ -56,6 +56,10 @@ class Interpretation:
     filter_key: str | None = None
     """Take the demonstrations of this filter key only (robomimic's mask)."""
 
+    def __post_init__(self) -> None:
+        if self.cut and self.solved == "all":
+            raise UserError("cut = True needs solved to be 'dones' or 'reward', which say where to cut; with 'all', demonstrations are kept whole")
+
 
 @dataclasses.dataclass(frozen=True)
 class ForeignDemonstration:

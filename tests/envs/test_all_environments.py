@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toy_env import FAST_COMPILATION
 
 from envs.grid import FixedGridPickAndPlace, GridPickAndPlace
 from envs.reach import FixedParameterizedReach, ParameterizedReach
@@ -47,7 +46,7 @@ def rollout(env, key):
 def episodes(env):
     """Three episodes, side by side; the first two with the same key."""
     keys = jax.vmap(jax.random.key)(jnp.array([0, 0, 1]))
-    return jax.device_get(jax.jit(jax.vmap(lambda key: rollout(env, key)), compiler_options=FAST_COMPILATION)(keys))
+    return jax.device_get(jax.jit(jax.vmap(lambda key: rollout(env, key)))(keys))
 
 
 @every_environment
@@ -110,7 +109,7 @@ def test_actions_are_clipped_to_the_bounds(env):
         state, _ = env.reset(key)
         return jax.vmap(lambda action: env.step(state, action)[1].observation)(actions)
 
-    clipped, exact = jax.jit(steps, compiler_options=FAST_COMPILATION)(jax.random.key(2))
+    clipped, exact = jax.jit(steps)(jax.random.key(2))
     np.testing.assert_array_equal(clipped, exact)
 
 

@@ -1,7 +1,6 @@
 """The arm against MuJoCo in C: the same chain, the same matrices, nearly the same motion; and the model file against robosuite's arm."""
 
 import contextlib
-import functools
 import importlib.util
 import io
 import time
@@ -11,7 +10,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from toy_env import FAST_COMPILATION
 
 from envs.reach import ParameterizedReach, panda
 from hindrl_jax.types import compiler_options
@@ -50,7 +48,7 @@ def jacobian(model, data):
 # --- the chain
 
 
-@functools.partial(jax.jit, compiler_options=FAST_COMPILATION)
+@jax.jit
 @jax.vmap
 def chain_at(joints):
     posture = panda.posture(joints)
@@ -79,7 +77,7 @@ def test_drag_is_that_of_mujoco():
     model = mujoco.MjModel.from_xml_path(str(panda.MODEL_PATH))
     model.opt.viscosity = 0.0  # which the closed form leaves out
     joints, velocities = random_joints(20), np.random.default_rng(1).normal(size=(20, 7)).astype(np.float32)
-    drag = jax.jit(jax.vmap(lambda q, v: panda.drag_torques(v, panda.posture(q))), compiler_options=FAST_COMPILATION)
+    drag = jax.jit(jax.vmap(lambda q, v: panda.drag_torques(v, panda.posture(q))))
     expected = np.stack([mujoco_at(q, v, model).qfrc_fluid for q, v in zip(joints, velocities, strict=True)])
     found = np.asarray(drag(joints, velocities))
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
@@ -101,7 +99,7 @@ def test_the_viscosity_that_is_left_out_is_below_a_hundredth_of_the_drag():
 def test_inverse(size):
     factors = np.random.default_rng(size).normal(size=(20, size, size))
     matrices = np.float32(factors @ factors.transpose(0, 2, 1) + 0.1 * np.eye(size))
-    found = jax.jit(jax.vmap(panda.inverse), compiler_options=FAST_COMPILATION)(matrices)
+    found = jax.jit(jax.vmap(panda.inverse))(matrices)
     expected = np.linalg.inv(matrices.astype(float))
     assert np.abs(found - expected).max() < 1e-4 * np.abs(expected).max()
 
@@ -128,9 +126,7 @@ def test_joint_targets_are_those_of_a_plain_loop():
     joints = START + rng.normal(0, 0.3, (num, 7)).astype(np.float32)
     rest = joints + np.where(np.arange(num) < 30, 0.05, 1.0)[:, None] * rng.normal(size=(num, 7))
     commands = rng.uniform(-2, 2, (num, 6)) * LIMITS * np.where(np.arange(num) % 2 == 0, 1.0, 0.2)[:, None]  # too long, and short ones
-    found = jax.jit(jax.vmap(lambda q, r, x: panda.joint_targets(q, r, x, panda.posture(q))), compiler_options=FAST_COMPILATION)(
-        joints, jnp.float32(rest), jnp.float32(commands)
-    )
+    found = jax.jit(jax.vmap(lambda q, r, x: panda.joint_targets(q, r, x, panda.posture(q))))(joints, jnp.float32(rest), jnp.float32(commands))
     expected = np.stack([joint_targets(panda.model(), mujoco_at(q), r, x) for q, r, x in zip(joints, rest, commands, strict=True)])
     nearly_singular = np.array([np.linalg.svd(jacobian(panda.model(), mujoco_at(q)))[1][-1] < 0.05 for q in joints])
     np.testing.assert_allclose(found[~nearly_singular], expected[~nearly_singular], atol=1e-5)
@@ -230,7 +226,7 @@ def motions(in_closed_form):
     return dict(zip(MOTIONS, np.asarray(joints), strict=False))
 
 
-hands = jax.jit(jax.vmap(lambda joints: panda.posture(joints).hand_position), compiler_options=FAST_COMPILATION)
+hands = jax.jit(jax.vmap(lambda joints: panda.posture(joints).hand_position))
 
 
 @pytest.mark.parametrize("name", MOTIONS)
@@ -262,7 +258,7 @@ def test_joint_limits_are_never_exceeded(in_closed_form):
 # --- friction
 
 
-@functools.partial(jax.jit, compiler_options=FAST_COMPILATION)
+@jax.jit
 def tracked(offsets):
     """Joints and velocities after one control step of `track` from rest, with the goals at these offsets from the joints."""
     c, joints = panda.chain(), jnp.asarray(START)
@@ -300,7 +296,7 @@ class Mjx:
         commands = rng.uniform(-1, 1, (self.num_steps, self.num_envs, 6))
         commands[:, : len(directions)] = directions
         self.commands = np.float32(commands * LIMITS)
-        reset = jax.jit(jax.vmap(env.reset), compiler_options=FAST_COMPILATION)
+        reset = jax.jit(jax.vmap(env.reset))
         self.start, _ = reset(jax.random.split(jax.random.key(0), self.num_envs))
 
         def run(state, commands):

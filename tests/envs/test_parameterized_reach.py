@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from toy_env import FAST_COMPILATION
 
 from envs.reach import FixedParameterizedReach, ParameterizedReach, ReachState, panda, rotations
 
@@ -19,7 +18,7 @@ BOTH_TASKS = pytest.mark.parametrize("task", [FixedParameterizedReach, Parameter
 FAR = (0.0, 0.1, 0.0)  # m
 TURNED = (0.0, 0.0, 0.3)  # rad
 
-compiled = functools.partial(jax.jit, compiler_options=FAST_COMPILATION)
+compiled = jax.jit
 
 
 def mujoco_hand(joints):

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from toy_env import FAST_COMPILATION
 
 from envs.reach import FixedParameterizedReach, panda
 
@@ -23,7 +22,7 @@ class KinematicReach(FixedParameterizedReach):
 
 
 class KinematicArm:
-    _control_step = staticmethod(jax.jit(control_step, compiler_options=FAST_COMPILATION))
+    _control_step = staticmethod(jax.jit(control_step))
 
     def __init__(self):
         self.redrawn = 0

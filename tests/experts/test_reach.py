@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toy_env import FAST_COMPILATION
 
 from envs.reach import FixedParameterizedReach, ParameterizedReach, panda, rotations
 from experts.reach import ReachExpert
@@ -15,7 +14,7 @@ from hindrl_jax.types import action_to_env
 
 ENV = FixedParameterizedReach()
 HAND = panda.posture(jnp.asarray(panda.INITIAL_JOINTS, jnp.float32))
-compiled = functools.partial(jax.jit, compiler_options=FAST_COMPILATION)
+compiled = jax.jit
 
 
 def place(offsets, turns, *, num_reached=0):

@@ -4,7 +4,6 @@ Tests that need robosuite are skipped where it is not installed.
 """
 
 import dataclasses
-import functools
 import importlib.util
 import os
 import subprocess
@@ -18,7 +17,6 @@ import numpy as np
 import pytest
 from commands import refusal
 from kinematic_arm import KinematicArm, KinematicReach
-from toy_env import FAST_COMPILATION
 
 from envs.reach import FixedParameterizedReach, panda, rotations
 from experts import robosuite_arm
@@ -71,7 +69,7 @@ def commands(name):
     return np.tile(direction * limits, (100, 1))
 
 
-@functools.partial(jax.jit, compiler_options=FAST_COMPILATION)
+@jax.jit
 def in_closed_form(joints, sequence):
     """(100, 7) joints after each command, by the closed form."""
 
@@ -130,8 +128,8 @@ def test_host_loop_plays_as_the_compiled_one_does():
     """With the same arm on both sides: every row, the padding included, but for actions, whose padding is 0 on the host."""
     env = KinematicReach(num_waypoints=1, position_tolerance=0.1, rotation_tolerance=0.3, horizon=19)
     act = expert_act(ReachExpert(randomness_scale=0.05), env)
-    expected = jax.jit(lambda key: play(key, env, act, 6), compiler_options=FAST_COMPILATION)(jax.random.key(4))
-    arm, jitted = KinematicArm(), jax.jit(act, compiler_options=FAST_COMPILATION)
+    expected = jax.jit(lambda key: play(key, env, act, 6))(jax.random.key(4))
+    arm, jitted = KinematicArm(), jax.jit(act)
     found = stacked([play_episode(key_episode, env, arm, jitted) for key_episode in jax.random.split(jax.random.key(4), 6)])
     lengths = np.asarray(expected.lengths)
     assert set(np.asarray(expected.terminated).tolist()) == {False, True}
@@ -184,7 +182,7 @@ def test_an_episode_in_robosuite_reaches_the_same_waypoints_in_closed_form(playe
     # An episode ends as soon as the hand is within the tolerance, so a hair's breadth more is granted to the replay.
     env = dataclasses.replace(IN_CLOSED_FORM, position_tolerance=0.0205, rotation_tolerance=0.054)
     start = env.vector_to_state(jax.random.key(0), episode.states[0])
-    replay = jax.jit(lambda state, actions: jax.lax.scan(env.step, state, actions), compiler_options=FAST_COMPILATION)
+    replay = jax.jit(lambda state, actions: jax.lax.scan(env.step, state, actions))
     state, _ = replay(start, actions[:length])
     assert int(state.num_reached) == 2
     np.testing.assert_allclose(state.joints, episode.states[-1][:7], atol=1e-3)  # 2e-4 was measured
@@ -306,7 +304,7 @@ def run(arm, tmp_path_factory):
     env = dataclasses.replace(COARSE, horizon=4, joint_noise=0.0, backend="closed_form")
     config = TrainConfig(algo="bc", agent=AgentConfig(net_arch=(4,)))
     dims = dict(observation_dim=env.observation_dim, goal_dim=env.goal_dim, action_dim=env.action_dim)
-    make_agents = jax.jit(jax.vmap(lambda key: agents.init(key, config.agent, **dims)), compiler_options=FAST_COMPILATION)
+    make_agents = jax.jit(jax.vmap(lambda key: agents.init(key, config.agent, **dims)))
     goals = GoalTable(goals=jnp.ones((2, 3, env.goal_dim)), count=jnp.full(2, 3))
     scale = {
         field.name: jnp.ones((2, env.observation_dim if field.name.startswith("observation") else env.goal_dim))
