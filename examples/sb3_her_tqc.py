@@ -94,7 +94,7 @@ def parse(given: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--num-envs", type=int, default=8)
     parser.add_argument("--gradient-steps", type=int, default=4, help="after each step of all environments")
     parser.add_argument("--eval-every", type=int, default=2_000)
-    parser.add_argument("--eval-episodes", type=int, default=50)
+    parser.add_argument("--eval-episodes", type=int, default=50, help="rounded up to as many in each environment")
     parser.add_argument("--seed", type=int, default=0)
     return parser.parse_args(given)
 

@@ -187,7 +187,7 @@ LEVERS: tuple[Lever, ...] = (
         (("batch.priority_exponent", 0.6), ("batch.demo_priority_bonus", 1.0)),
     ),
     Lever("batch-1024", "replay", "batches of 1,024 rows in place of 256", (("batch.batch_size", 1_024),)),
-    Lever("truncation-0.02", "rollout", "training episodes are cut off after a step with probability 0.02", (("random_truncation", 0.02),)),
+    Lever("random-truncation-0.02", "rollout", "training episodes are cut off after a step with probability 0.02", (("random_truncation", 0.02),)),
     Lever(
         "environments-64",
         "rollout",

@@ -135,7 +135,8 @@ class GoalEnv(gymnasium.Env[Observation, np.ndarray]):
       **arguments: fields of the environment but `horizon`, which is Gymnasium's `max_episode_steps`.
 
     Raises:
-      UserError: for a name, an argument or a render mode that does not exist, or rules under which there is no `compute_reward`.
+      UserError: for a name, an argument, a render mode or a value of continuing_task that does not exist, or rules under which there is no
+        `compute_reward`.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012, as Gymnasium reads it off the class
@@ -228,6 +229,9 @@ class GoalVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
       max_episode_steps: number of steps after which an episode is truncated; None or -1 is never.
       autoreset_mode: when an ended episode gives way to the next. "NextStep", Gymnasium's default: at the next step, whose action is ignored.
         "SameStep": at once; its last observation is in info["final_obs"]. "Disabled": by `reset`, with options {"reset_mask": (E,) bool}.
+
+    Raises:
+      UserError: as `GoalEnv`, and for a horizon that is none.
     """
 
     def __init__(
@@ -253,7 +257,7 @@ class GoalVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         self.observation_space, self.action_space = (
             batch_space(space, num_envs) for space in (self.single_observation_space, self.single_action_space)
         )
-        self._start, self._restart, self._step = _vector_programs(self._task.env, continuing_task, int(limit), self.autoreset_mode)
+        self._start, self._restart, self._step = _vector_programs(self._task.env, continuing_task, min(int(limit), _NEVER), self.autoreset_mode)
         self._lives: _Lives | None = None
 
     def reset(self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:

@@ -12,14 +12,13 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
 import io
 import logging
 import os
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -183,14 +182,12 @@ class Checkpoints:
 
     @contextlib.contextmanager
     def _damage(self, path: Path) -> Iterator[None]:
-        hook = sys.unraisablehook
-        sys.unraisablehook = functools.partial(_report_unless_late, hook)
+        """What goes wrong here says that the checkpoint is damaged; and of the arrays that are still being read then, nobody hears."""
         try:
-            yield
+            with _unheard_when_late():
+                yield
         except (OSError, ValueError, KeyError, TypeError) as error:  # what libraries say of bytes that make no sense
-            # The hook stays: of the arrays that were being read at the same time, some are done only now, and nobody waits for them.
             raise UserError(f"{path} is damaged ({one_line(error)[:200]}): remove it to begin again") from error
-        sys.unraisablehook = hook
 
 
 def _orbax() -> Any:
@@ -201,10 +198,27 @@ def _orbax() -> Any:
     return ocp
 
 
-def _report_unless_late(hook: Callable[[Any], object], unraisable: Any) -> None:
-    """Reports an exception that nobody can catch, but for that of an array read by Orbax after another one had failed."""
-    if str(unraisable.exc_value) != "Event loop is closed":
-        hook(unraisable)
+@contextlib.contextmanager
+def _unheard_when_late() -> Iterator[None]:
+    """Orbax reads all arrays at once, and when one fails gives the others up: what they then say to its closed loop is not printed.
+
+    They may say it at any later time, so after a failure this lasts.
+    """
+    hook = sys.unraisablehook
+
+    def report(unraisable: Any) -> None:
+        if str(unraisable.exc_value) != "Event loop is closed":
+            hook(unraisable)
+
+    sys.unraisablehook, failed = report, False
+    try:
+        yield
+    except Exception:
+        failed = True
+        raise
+    finally:
+        if not failed:
+            sys.unraisablehook = hook
 
 
 def _trees(result: Result) -> tuple[Any, ...]:

@@ -55,9 +55,9 @@ class BatchConfig:
     """No target lies below the return that the row's own episode went on to obtain, which is a lower bound of the optimal value where neither
     actions nor rewards are random (He et al., optimality tightening, 2017; Oh et al., self-imitation learning, 2018)."""
     timeouts_are_terminal: bool = False
-    """Treat episodes cut by the horizon as terminated, as the original code does by mistake."""
+    """Treat episodes that are cut, by the horizon or by random_truncation, as terminated, as the original code does by mistake."""
     priority_exponent: float = 0.0
-    """0 draws transitions uniformly. More draws them in proportion to their temporal-difference error to this power (Schaul et al., prioritised
+    """0 draws uniformly, an episode, then one of its transitions. More draws transitions in proportion to their temporal-difference error to this power (Schaul et al., prioritised
     experience replay, 2016), from demonstrations and replay together: max_demo_ratio and reach_zero then have no say."""
     importance_exponent: float = 0.4
     """With priorities: 1 corrects the critics' loss wholly for what is drawn too often, 0 not at all. Schaul's first value, kept: his rise to 1
@@ -324,7 +324,8 @@ class TrainConfig:
     random_truncation: float = 0.0
     """Probability with which a training episode is cut off after a step, as a time-out cuts it: the future value still counts (unless
     timeouts_are_terminal). Episodes that stand still are left sooner, and more are begun. Evaluations are never cut. Each episode keeps room for a
-    whole horizon in the replay, which so holds fewer transitions than buffer_size."""
+    whole horizon in the replay, which so holds fewer transitions than buffer_size; and since an episode is drawn before one of its transitions,
+    those of short episodes are drawn more often."""
     bc_warm_start: int = 0
     """Gradient steps of behaviour cloning alone before the first of reinforcement learning, after the random actions of learning_starts."""
     pretrain_updates: int = 0

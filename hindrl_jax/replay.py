@@ -7,7 +7,13 @@ observations, where those hold what an episode is about and it is told anew (`Re
 Every environment owns a ring of episode slots, so that writing needs no bookkeeping between environments. One slot per ring is being written;
 only complete episodes are sampled, and an episode is overwritten as a whole.
 
-Transitions are drawn uniformly, by `sample_batch`, or by their priorities, by `sample_prioritised_batch`; both read what they have drawn alike.
+Transitions are drawn uniformly by episode, then by step, with `sample_batch`, or by their priorities, with `sample_prioritised_batch`; both read what
+they have drawn alike:
+
+    told = read_steps(episodes, rows, steps, n_step)        # as it was lived
+    told = retell(told, chosen, tell)                       # where hindsight changes what was seen
+    told = judge_by_goals(told, others, goals, ...)         # where it changes the goal: no row takes part in both
+    batch = transitions(told, goals, ...)                   # n-step returns, each up to where it ends by then
 """
 
 from __future__ import annotations
@@ -160,82 +166,103 @@ def sample_steps(key: Array, episodes: Episodes, rows: Array) -> Array:
 class Steps(struct.PyTreeNode, kw_only=True):
     """The n steps from each of B drawn transitions on, over which its return is taken. Past the end of the episode its last step is repeated."""
 
-    rows: Array  # (B,) int32, episodes
-    steps: Array  # (B,) int32, of the drawn transitions
     observation: Array  # (B, D), before the first step
-    next_observations: Array  # (B, n, D), after each
+    action: Array  # (B, A), at the first step
+    next_observations: Array  # (B, n, D), after each step
     rewards: Array  # (B, n)
     inside: Array  # (B, n) bool, whether the episode was not over before
     is_last: Array  # (B, n) bool, whether it is over after
-    terminated: Array  # (B,) bool, whether that is the end of the task
+    terminated: Array  # (B,) bool, whether its end is a termination, rather than a truncation
+    steps_left: Array  # (B,) int32, from the first of these steps to the last one of the episode
+    last_reward: Array  # (B,), at the last step of the episode
     ends: Array  # (B, n) bool, whether hindsight has the task end there
+    by_hindsight: Array  # (B,) bool, whether rewards are those of hindsight, of which the episode's own last reward says nothing
 
 
 def read_steps(episodes: Episodes, rows: Array, steps: Array, n_step: int) -> Steps:
-    """Reads `n_step` steps as they were lived: rows and steps (B,) int32."""
-    lengths = episodes.lengths[rows][:, None]
+    """Reads steps as they were lived.
+
+    Args:
+      episodes: N of them.
+      rows: (B,) int32, episodes.
+      steps: (B,) int32, the first step to read of each; 0 <= step < length.
+      n_step: n.
+    """
+    lengths = episodes.lengths[rows]
     window = steps[:, None] + jnp.arange(n_step)[None]
-    inside = window < lengths
-    window = jnp.minimum(window, lengths - 1)
+    inside = window < lengths[:, None]
+    window = jnp.minimum(window, lengths[:, None] - 1)
     return Steps(
-        rows=rows,
-        steps=steps,
         observation=episodes.observations[rows, steps],
+        action=episodes.actions[rows, steps],
         next_observations=episodes.observations[rows[:, None], window + 1],
         rewards=episodes.rewards[rows[:, None], window],
         inside=inside,
-        is_last=window == lengths - 1,
+        is_last=window == lengths[:, None] - 1,
         terminated=episodes.terminated[rows],
+        steps_left=lengths - 1 - steps,
+        last_reward=episodes.rewards[rows, lengths - 1],
         ends=jnp.zeros_like(inside),
+        by_hindsight=jnp.zeros(rows.shape, bool),
     )
 
 
 def judge_by_goals(
-    lived: Steps, chosen: Array, goals: Array, *, achieved_goal: Callable[[Array], Array], epsilon: Array, config: BatchConfig
+    told: Steps, chosen: Array, goals: Array, *, achieved_goal: Callable[[Array], Array], epsilon: Array, config: BatchConfig
 ) -> Steps:
-    """Rewards the chosen rows (B,) where they reach goals (B, G), by the box test on the goal achieved after each step (thesis eq. 2.29 and 4.8).
+    """Rewards rows where they reach goals, by the box test on the goal achieved after each step (thesis eq. 2.29 and 4.8).
 
     With `terminate_on_relabel` they end there.
+
+    Args:
+      told: B rows of n steps.
+      chosen: (B,) bool, the rows to judge; the others stay as they are.
+      goals: (B, G).
+      achieved_goal: projection of observations (..., D) to goals (..., G).
+      epsilon: (G,) half-width of the goal box.
+      config: the goal test, and whether a reached goal ends the row.
     """
-    reached = goal_reached(achieved_goal(lived.next_observations), goals[:, None], epsilon, inclusive=config.inclusive_goal_test) & chosen[:, None]
-    judged = lived.replace(rewards=jnp.where(chosen[:, None], reached.astype(jnp.float32), lived.rewards))
-    return judged.replace(ends=lived.ends | reached) if config.terminate_on_relabel else judged
+    reached = goal_reached(achieved_goal(told.next_observations), goals[:, None], epsilon, inclusive=config.inclusive_goal_test) & chosen[:, None]
+    return told.replace(
+        rewards=jnp.where(chosen[:, None], reached.astype(jnp.float32), told.rewards),
+        ends=told.ends | reached if config.terminate_on_relabel else told.ends,
+        by_hindsight=told.by_hindsight | chosen,
+    )
 
 
-def retell(lived: Steps, chosen: Array, tell: Callable[[Array], tuple[Array, Array]]) -> Steps:
-    """Tells the chosen rows (B,) anew: rewarded, and over, where the task is then solved.
+def retell(told: Steps, chosen: Array, tell: Callable[[Array], tuple[Array, Array]]) -> Steps:
+    """Tells rows anew: rewarded, and over, where the task is then solved.
 
     They end there whatever `terminate_on_relabel` says: no row begins in a solved state, so the value of one is never learnt.
 
     Args:
-      lived, chosen: see above.
+      told: B rows of n steps, as they were lived.
+      chosen: (B,) bool, the rows to tell anew; the others stay as they are.
       tell: observations (B, n + 1, D) -> what is seen in their place, and (B, n) bool, whether the task is solved after each step.
     """
-    seen, solved = tell(jnp.concatenate([lived.observation[:, None], lived.next_observations], axis=1))
+    seen, solved = tell(jnp.concatenate([told.observation[:, None], told.next_observations], axis=1))
     solved &= chosen[:, None]
-    return lived.replace(
-        observation=jnp.where(chosen[:, None], seen[:, 0], lived.observation),
-        next_observations=jnp.where(chosen[:, None, None], seen[:, 1:], lived.next_observations),
-        rewards=jnp.where(chosen[:, None], solved.astype(jnp.float32), lived.rewards),
-        terminated=lived.terminated & ~chosen,  # where the task was solved in truth, the story may go on
-        ends=lived.ends | solved,
+    return told.replace(
+        observation=jnp.where(chosen[:, None], seen[:, 0], told.observation),
+        next_observations=jnp.where(chosen[:, None, None], seen[:, 1:], told.next_observations),
+        rewards=jnp.where(chosen[:, None], solved.astype(jnp.float32), told.rewards),
+        terminated=told.terminated & ~chosen,  # where the task was solved in truth, the story may go on
+        ends=told.ends | solved,
+        by_hindsight=told.by_hindsight | chosen,
     )
 
 
-def transitions(
-    episodes: Episodes, told: Steps, desired_goals: Array, *, by_hindsight: Array, is_demonstration: bool, config: BatchConfig
-) -> Transition:
+def transitions(told: Steps, desired_goals: Array, *, is_relabelled: Array | bool, is_demonstration: bool, config: BatchConfig) -> Transition:
     """The n-step transitions of steps as they are told.
 
     A return ends after n steps, at the end of the episode, or where hindsight has the task end, whichever comes first.
 
     Args:
-      episodes: where the steps were read.
       told: B rows of n steps.
       desired_goals: (B, G).
-      by_hindsight: (B,) bool, rows that were judged by their goals or told anew: what their episodes obtained says nothing of them.
+      is_relabelled: (B,) bool, or one for all, notes which rows have a goal or a story of hindsight in place of their own.
       is_demonstration: marks the rows for the behaviour cloning loss.
-      config: gamma, and the rules of termination.
+      config: gamma, `timeouts_are_terminal` and `bound_by_obtained_return`.
 
     Returns:
       The batch. Where the return ended by termination the discount is 0, else gamma to the number of steps taken.
@@ -245,25 +272,19 @@ def transitions(
     counted = told.inside & ~ended_before
     num_steps = jnp.sum(counted, axis=1)  # (B,), at least 1
     discounts = config.gamma ** jnp.arange(ends.shape[1], dtype=jnp.float32)
-    last = (num_steps - 1)[:, None]
+    last, size = (num_steps - 1)[:, None], num_steps.shape
+    obtained = jnp.where(told.by_hindsight, 0.0, told.last_reward * config.gamma ** told.steps_left.astype(jnp.float32))
     return Transition(
         observation=told.observation,
-        action=episodes.actions[told.rows, told.steps],
+        action=told.action,
         reward=jnp.sum(jnp.where(counted, told.rewards * discounts[None], 0.0), axis=1),
         discount=jnp.where(jnp.take_along_axis(ends, last, axis=1)[:, 0], 0.0, config.gamma**num_steps),
         next_observation=jnp.take_along_axis(told.next_observations, last[..., None], axis=1)[:, 0],
         desired_goal=desired_goals,
-        is_demonstration=jnp.full(told.rows.shape, is_demonstration),
-        is_relabelled=by_hindsight,
-        obtained_return=_obtained_return(episodes, told, by_hindsight, config) if config.bound_by_obtained_return else None,
+        is_demonstration=jnp.full(size, is_demonstration),
+        is_relabelled=jnp.broadcast_to(is_relabelled, size),
+        obtained_return=obtained if config.bound_by_obtained_return else None,
     )
-
-
-def _obtained_return(episodes: Episodes, told: Steps, by_hindsight: Array, config: BatchConfig) -> Array:
-    """(B,) discounted reward at the end of each row's own episode, seen from its step; 0 for rows told by hindsight."""
-    last = episodes.lengths[told.rows] - 1
-    reward = episodes.rewards[told.rows, last] * config.gamma ** (last - told.steps).astype(jnp.float32)
-    return jnp.where(by_hindsight, 0.0, reward)
 
 
 def num_demo_rows(env_steps: Array, config: BatchConfig) -> Array:
@@ -372,16 +393,14 @@ def _replay_rows(
         judged_by_goal |= relabelled
     # A row of an episode that is judged by its behavioural goal is read as if that were a goal chosen in hindsight.
     told = judge_by_goals(told, judged_by_goal, goals, achieved_goal=achieved_goal, epsilon=epsilon, config=config)
-    batch = transitions(replay.episodes, told, goals, by_hindsight=judged_by_goal | relabelled, is_demonstration=False, config=config)
-    return batch.replace(is_relabelled=relabelled)
+    return transitions(told, goals, is_relabelled=relabelled, is_demonstration=False, config=config)
 
 
 def demonstration_rows(demonstrations: Episodes, rows: Array, steps: Array, config: BatchConfig) -> Transition:
     """Reads rows of the demonstrations, which are never relabelled: rows and steps (B,) int32 -> the batch."""
     n_step = demonstrations.rewards.shape[1] if config.demo_returns == "monte_carlo" else config.n_step
     lived = read_steps(demonstrations, rows, steps, n_step)
-    never = jnp.zeros(rows.shape, bool)
-    return transitions(demonstrations, lived, demonstrations.desired_goals[rows], by_hindsight=never, is_demonstration=True, config=config)
+    return transitions(lived, demonstrations.desired_goals[rows], is_relabelled=False, is_demonstration=True, config=config)
 
 
 def sample_batch(

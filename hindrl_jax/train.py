@@ -208,13 +208,13 @@ def make_policy(actor: Any, scale: InputScale, env: Environment, config: TrainCo
 
 def _interact(key: Array, state: TrainState, data: Guidance, env: Environment, config: TrainConfig, act: Act) -> TrainState:
     """One step of every environment, stored in the replay."""
-    key_act, key_reset, key_goals, key_nearby = jax.random.split(key, 4)
+    key_act, key_reset, key_goals, key_nearby, key_cut = jax.random.split(key, 5)
     before = state.rollout
     action = act(key_act, before.observation, before.desired_goal)
     restarted = _new_episodes(key_reset, data, env, config, _progress(state, config))
     cut = None
     if config.random_truncation > 0.0:
-        cut = jax.random.bernoulli(jax.random.fold_in(key, 4), config.random_truncation, (config.num_envs,))  # 4: split has used what 0 to 3 give
+        cut = jax.random.bernoulli(key_cut, config.random_truncation, (config.num_envs,))
     after, time_step = rollout.step(before, restarted, action, env, cut=cut)
     return remember(key_goals, key_nearby, state, action, time_step, after, data, env, config)
 

@@ -23,7 +23,7 @@ class TimeStep(struct.PyTreeNode, kw_only=True):
     observation: Array  # (D,) float32
     reward: Array  # () float32, 1 where the task is solved by this step, else 0
     terminated: Array  # () bool, the task is over (solved); there is no future value
-    truncated: Array  # () bool, the horizon cut the episode; the future value still exists
+    truncated: Array  # () bool, the horizon, or the training, cut the episode; the future value still exists
 
 
 class Episodes(struct.PyTreeNode, kw_only=True):

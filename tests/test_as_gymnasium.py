@@ -167,12 +167,9 @@ def test_without_autoreset_only_the_chosen_begin_anew():
 
 
 def test_a_solved_episode_gives_way_to_the_next():
-    """An agent that starts on the object, one cell from the goal, grabs it and goes there."""
-    task = dict(num_objects=1, size=2, random_box_size=1)  # agent at (0, 0), goal at (0, 1), object at (1, 0)
-    env = gymnasium.make_vec(GRID, 1, **task)
+    env = gymnasium.make_vec(GRID, 1, **TINY)
     env.reset(seed=0)
-    right, down_grabbing, left_grabbing = [1, -1, -1, -1, -1], [-1, 1, -1, -1, 1], [-1, -1, 1, -1, 1]
-    results = [env.step(np.array([action], np.float32)) for action in (right, down_grabbing, left_grabbing, right)]
+    results = [env.step(action[None]) for action in (*SOLUTION[:3], SOLUTION[0])]
     assert [bool(terminated[0]) for _, _, terminated, _, _ in results] == [False, False, True, False]
     assert [float(reward[0]) for _, reward, *_ in results] == [0.0, 0.0, 1.0, 0.0]
     assert [bool(info["is_success"][0]) for *_, info in results] == [False, False, True, False]
@@ -181,11 +178,9 @@ def test_a_solved_episode_gives_way_to_the_next():
 
 
 def test_a_continuing_task_is_cut_by_the_horizon_alone():
-    task = dict(num_objects=1, size=2, random_box_size=1)  # as above
-    env = gymnasium.make_vec(GRID, 1, max_episode_steps=4, continuing_task=True, **task)
+    env = gymnasium.make_vec(GRID, 1, max_episode_steps=4, continuing_task=True, **TINY)
     env.reset(seed=0)
-    down_grabbing, left_grabbing, stay = [-1, 1, -1, -1, 1], [-1, -1, 1, -1, 1], [-1, -1, 1, -1, 1]
-    results = [env.step(np.array([action], np.float32)) for action in ([1, -1, -1, -1, -1], down_grabbing, left_grabbing, stay)]
+    results = [env.step(action[None]) for action in SOLUTION]
     assert [float(reward[0]) for _, reward, *_ in results] == [0.0, 0.0, 1.0, 1.0]
     assert [bool(info["is_success"][0]) for *_, info in results] == [False, False, True, True]
     assert [(bool(terminated[0]), bool(truncated[0])) for _, _, terminated, truncated, _ in results] == 3 * [(False, False)] + [(False, True)]

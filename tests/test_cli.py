@@ -7,6 +7,7 @@ import dataclasses
 import json
 import re
 import shlex
+import signal
 import subprocess
 import sys
 import time
@@ -71,9 +72,15 @@ def test_an_interrupt_that_nobody_saw_comes_again(monkeypatch, capsys):
 
 
 def test_an_interrupt_does_not_outlive_its_command(monkeypatch):
+    came, before = [], signal.getsignal(signal.SIGINT)
     monkeypatch.setitem(cli.COMMANDS, "envs", lambda arguments: Forgetful() and None)
-    cli.main(["envs"])
-    time.sleep(0.3)
+    try:
+        signal.signal(signal.SIGINT, lambda *given: came.append(given))
+        cli.main(["envs"])
+        time.sleep(0.3)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert not came
 
 
 def test_options_that_change_nothing_are_warned_about():

@@ -509,7 +509,7 @@ def test_jitted_equals_not_jitted():
         chosen = goals[:, 2] < 2
         told = read_steps(episodes, rows, steps, BATCH.n_step)
         told = judge_by_goals(told, chosen, goals, achieved_goal=identity, epsilon=jnp.zeros(3), config=BATCH)
-        return transitions(episodes, told, goals, by_hindsight=chosen, is_demonstration=False, config=BATCH)
+        return transitions(told, goals, is_relabelled=chosen, is_demonstration=False, config=BATCH)
 
     arguments = (demonstrations(), jnp.array([0, 2, 2, 1]), jnp.array([1, 0, 1, 0]), jnp.array([[DEMO, 2.0, t] for t in range(4)]))
     jax.tree.map(np.testing.assert_array_equal, jax.jit(read)(*arguments), read(*arguments))
@@ -627,7 +627,7 @@ def test_transitions_are_those_of_a_plain_loop(lengths, places, terminated, chos
         told, chosen, jnp.asarray(goals), achieved_goal=lambda observation: observation[..., 2:], epsilon=jnp.array([epsilon]), config=config
     )
     desired = jnp.where(chosen[:, None], goals, table.desired_goals[rows])
-    batch = jax.device_get(transitions(table, told, desired, by_hindsight=chosen, is_demonstration=is_demonstration, config=config))
+    batch = jax.device_get(transitions(told, desired, is_relabelled=chosen, is_demonstration=is_demonstration, config=config))
     for i in range(ROWS):
         reward, discount, following, goal = transition_twin(
             episodes, rows[i], steps[i], goals[i, 0], relabelled=relabelled[i], epsilon=epsilon, config=config

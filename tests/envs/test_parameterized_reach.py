@@ -18,8 +18,6 @@ BOTH_TASKS = pytest.mark.parametrize("task", [FixedParameterizedReach, Parameter
 FAR = (0.0, 0.1, 0.0)  # m
 TURNED = (0.0, 0.0, 0.3)  # rad
 
-compiled = jax.jit
-
 
 def mujoco_hand(joints):
     """Position (3,) and matrix (3, 3) of the hand, by MuJoCo in C."""
@@ -46,18 +44,18 @@ def place(offsets, turns=None, *, joints=panda.INITIAL_JOINTS, num_reached=0, st
     )
 
 
-@functools.partial(compiled, static_argnums=0)
+@functools.partial(jax.jit, static_argnums=0)
 def stay(env, state):
     """What becomes of a step in which the arm does not move."""
     return env.arrive(state, state.joints, state.velocities)
 
 
-@functools.partial(compiled, static_argnums=0)
+@functools.partial(jax.jit, static_argnums=0)
 def step(env, state, action):
     return env.step(state, action)
 
 
-@functools.partial(compiled, static_argnums=0)
+@functools.partial(jax.jit, static_argnums=0)
 def observe(env, state):
     return env.observe(state)
 
@@ -65,7 +63,7 @@ def observe(env, state):
 NUM_RESETS = 3000
 
 
-@functools.partial(compiled, static_argnums=0)
+@functools.partial(jax.jit, static_argnums=0)
 def resets(env):
     """Start states, with observations."""
     return jax.vmap(env.reset)(jax.random.split(jax.random.key(3), NUM_RESETS))
@@ -74,10 +72,10 @@ def resets(env):
 # --- rotations
 
 
-to_vectors = compiled(jax.vmap(rotations.to_rotation_vector))
-from_vectors = compiled(jax.vmap(rotations.from_rotation_vector))
-six_d = compiled(jax.vmap(rotations.to_six_d))
-between = compiled(jax.vmap(rotations.between))
+to_vectors = jax.jit(jax.vmap(rotations.to_rotation_vector))
+from_vectors = jax.jit(jax.vmap(rotations.from_rotation_vector))
+six_d = jax.jit(jax.vmap(rotations.to_six_d))
+between = jax.jit(jax.vmap(rotations.between))
 UNIT_VECTORS = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1).map(lambda v: np.array(v) / np.linalg.norm(v))
 
 
@@ -152,7 +150,7 @@ def test_without_noise_every_episode_starts_in_the_same_place():
 
 def test_starts_are_within_the_joint_limits():
     env, chain = FixedParameterizedReach(joint_noise=1.0), panda.chain()
-    state, _ = compiled(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 50))
+    state, _ = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 50))
     joints = np.asarray(state.joints)
     assert (joints >= np.float32(chain.lower)).all()
     assert (joints <= np.float32(chain.upper)).all()
@@ -346,9 +344,9 @@ def test_a_story_told_anew_is_what_would_have_been_observed(arguments):
     state = place(
         np.linspace((0.1, 0.0, 0.1), (-0.1, 0.2, 0.0), count), np.linspace((0.3, 0, 0), (0, 0, 0.2), count), joints=joints[0], num_reached=1
     )
-    look = compiled(jax.vmap(lambda q, reached: env.observe(state.replace(joints=q, num_reached=reached))))
+    look = jax.jit(jax.vmap(lambda q, reached: env.observe(state.replace(joints=q, num_reached=reached))))
     observations = look(jnp.asarray(joints, jnp.float32), jnp.asarray(np.arange(30) >= 8, jnp.int32))  # lived, a waypoint is reached on the way
-    retell, arrive = compiled(env.retell), compiled(env.arrive)
+    retell, arrive = jax.jit(env.retell), jax.jit(env.arrive)
     told_counts, solved_at_all = set(), []
     for seed in range(12):
         start = starts[seed % 3]
@@ -418,7 +416,7 @@ def test_a_step_moves_the_arm_as_the_controller_does(task):
     np.testing.assert_allclose(task().action_high, [0.02] * 3 + [0.05] * 3, rtol=1e-6)
     np.testing.assert_allclose(task().action_low, -task().action_high)
     after, time_step = step(task(), state, action)
-    joints, velocities = compiled(panda.control_step)(state.joints, state.velocities, state.rest, clipped)
+    joints, velocities = jax.jit(panda.control_step)(state.joints, state.velocities, state.rest, clipped)
     np.testing.assert_allclose(after.joints, joints, atol=1e-6)
     np.testing.assert_allclose(after.velocities, velocities, atol=1e-5)
     np.testing.assert_array_equal(after.rest, state.rest)

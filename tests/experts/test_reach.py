@@ -14,7 +14,6 @@ from hindrl_jax.types import action_to_env
 
 ENV = FixedParameterizedReach()
 HAND = panda.posture(jnp.asarray(panda.INITIAL_JOINTS, jnp.float32))
-compiled = jax.jit
 
 
 def place(offsets, turns, *, num_reached=0):
@@ -33,7 +32,7 @@ def place(offsets, turns, *, num_reached=0):
     return ENV.vector_to_state(jax.random.key(0), vector)
 
 
-@functools.partial(compiled, static_argnums=(0, 2))
+@functools.partial(jax.jit, static_argnums=(0, 2))
 def decisions(expert, state, num=1):
     """(num, 6) actions under many keys."""
     return jax.vmap(lambda key: expert.act(key, ENV, state))(jax.random.split(jax.random.key(1), num))
@@ -96,7 +95,7 @@ def played(request):
     """The task, its episodes without noise, and those with it."""
     env = request.param(horizon=400)
 
-    @compiled
+    @jax.jit
     def run(key, is_noisy):  # one program for both experts
         def act(key, state, observation):
             steady = ReachExpert(0.0).act(jax.random.key(0), env, state)  # whatever the key
