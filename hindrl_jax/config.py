@@ -57,8 +57,9 @@ class BatchConfig:
     timeouts_are_terminal: bool = False
     """Treat episodes that are cut, by the horizon or by random_truncation, as terminated, as the original code does by mistake."""
     priority_exponent: float = 0.0
-    """0 draws uniformly, an episode, then one of its transitions. More draws transitions in proportion to their temporal-difference error to this power (Schaul et al., prioritised
-    experience replay, 2016), from demonstrations and replay together: max_demo_ratio and reach_zero then have no say."""
+    """0 draws uniformly, an episode, then one of its transitions. More draws transitions in proportion to their temporal-difference error to this
+    power (Schaul et al., prioritised experience replay, 2016), from demonstrations and replay together: max_demo_ratio and reach_zero then have no
+    say."""
     importance_exponent: float = 0.4
     """With priorities: 1 corrects the critics' loss wholly for what is drawn too often, 0 not at all. Schaul's first value, kept: his rise to 1
     makes the end of training unbiased, and sparse rewards are found long before."""
