@@ -65,7 +65,6 @@ _ARM_AGENT = AgentConfig(
     clip_targets=True,
     actor_average_rate=1.0,
     actor_average_span=0.5,
-    final_target_entropy=-8.0,
     relative_value=True,
     bc_weight=0.03,
     final_bc_weight=0.0,
@@ -97,7 +96,7 @@ def _default(algo: Algorithm, family: Family) -> TrainConfig:
         eval_episodes=20,
         batch=BatchConfig(n_step=10, gamma=0.99, bound_by_obtained_return=True),
         goal=GoalConfig(m=5, k=0.0),
-        agent=dataclasses.replace(_ARM_AGENT, target_update_rate=0.01, input_encoding=encoding),
+        agent=dataclasses.replace(_ARM_AGENT, target_update_rate=0.01, final_target_entropy=-4.0, input_encoding=encoding),
     )
 
 
@@ -112,7 +111,7 @@ def _retold() -> TrainConfig:
         eval_every=10_000,
         batch=BatchConfig(n_step=3, max_demo_ratio=0.125, num_sampled_goals=4.0, hindrl_sampling_strategy="joint_union"),
         goal=GoalConfig(m=5, behavioural_goals="task"),
-        agent=_ARM_AGENT,
+        agent=dataclasses.replace(_ARM_AGENT, final_target_entropy=-8.0),
     )
 
 
