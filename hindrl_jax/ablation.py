@@ -1,6 +1,6 @@
-"""Ablation: the default recipe of the grid tasks with one change at a time, on several tasks, with the same seeds for every change.
+"""Ablation: the first life of the grid tasks' default recipe with one change at a time, on several tasks, with the same seeds for every change.
 
-    OUT/TASK/LEVER/    an ordinary run's directory for each setting; OUT/TASK/default/ is the recipe as it is, the baseline
+    OUT/TASK/LEVER/    an ordinary run's directory for each setting; OUT/TASK/default/ has no change, the baseline
     ablation.csv       a row for each setting
     ablation.md        the same for people: a table for each task
     ablation.png       the differences to the baseline
@@ -55,7 +55,7 @@ def half_of_the_run(config: TrainConfig) -> int:
     return config.steps // 2
 
 
-BASELINE = Lever("default", "baseline", "the default recipe as it is", ())
+BASELINE = Lever("default", "baseline", "the default recipe, without a second life of its agent", ())
 
 LEVERS: tuple[Lever, ...] = (
     Lever("sac", "algorithm", "SAC in place of TQC", (("agent.base", "sac"),)),
@@ -127,7 +127,7 @@ LEVERS: tuple[Lever, ...] = (
     Lever(
         "demo-rows-fade",
         "demonstrations",
-        "the share of demonstration rows falls to zero until half of the run (thesis)",
+        "the share of demonstration rows falls to zero by the middle of the run (thesis)",
         (("batch.reach_zero", half_of_the_run),),
     ),
     Lever("bc-0", "demonstrations", "no cloning loss", (("agent.bc_weight", 0.0),)),
@@ -172,7 +172,7 @@ LEVERS: tuple[Lever, ...] = (
     Lever(
         "no-actor-average",
         "actor",
-        "the actor is evaluated as it is, not its running average",
+        "the actor itself is evaluated, not its running average",
         (("agent.actor_average_rate", 1.0), ("agent.actor_average_span", 0.0)),
     ),
     Lever(
@@ -183,7 +183,7 @@ LEVERS: tuple[Lever, ...] = (
     Lever(
         "prioritised",
         "replay",
-        "transitions drawn by their errors, demonstrations with a bonus, which become few (prioritised replay; DDPGfD)",
+        "rows drawn by their errors, those of demonstrations with a bonus, which leaves few of them (prioritised replay; DDPGfD)",
         (("batch.priority_exponent", 0.6), ("batch.demo_priority_bonus", 1.0)),
     ),
     Lever("batch-1024", "replay", "batches of 1,024 rows in place of 256", (("batch.batch_size", 1_024),)),
@@ -191,7 +191,7 @@ LEVERS: tuple[Lever, ...] = (
     Lever(
         "environments-64",
         "rollout",
-        "64 environments side by side, whose steps are four times as many for each gradient step",
+        "64 environments in place of 16: four times as many environment steps for each gradient step",
         (("num_envs", 64), ("learning_starts", 6_400)),
     ),
     Lever("updates-8", "rollout", "8 gradient steps per vectorised environment step in place of 2", (("updates_per_iteration", 8),)),
@@ -474,19 +474,19 @@ def _csv_row(outcome: Outcome) -> dict[str, Any]:
 
 _EXPLANATION = """# Ablation
 
-The default recipe, until its agent would begin anew, with one change at a time, {seeds} seeds from {first}, {steps:,} environment steps each. Every
+The default recipe, without a second life of its agent, with one change at a time, {seeds} seeds from {first}, {steps:,} environment steps each. Every
 change is trained with the same seeds, which have the same demonstrations. In brackets: 95% bootstrap intervals over the seeds, somewhat too narrow
 with 16 seeds and much too narrow with fewer than 8 or so. They describe single comparisons: of changes without any effect, one in twenty or more
 shows a difference by chance.
 
 - **95%**: seeds of which an evaluation along the run reached 95% success.
-- **steps to 95%**: environment steps to the first such evaluation, median over all seeds; > is said where the run ended before.
+- **steps to 95%**: environment steps to the first such evaluation, median over all seeds; > and the length of the run where most never did.
 - **final**: success of the final policy in fresh episodes, mean over seeds, in %.
 - **along**: success along the whole run, mean over its steps and over seeds, in %. It sees both speed and the level that is reached.
 - **difference**: the default's "along" subtracted seed by seed, in points; bold where the interval leaves out 0.
 - **s/seed**: seconds of training per seed, all seeds side by side, without compilation.
-- **cost**: seconds per gradient step, rollouts and evaluations included, relative to the default's. Both were measured once, along the way; it
-  says something only where the machine had nothing else to do.
+- **cost**: seconds per gradient step, rollouts and evaluations included, relative to the default's. Times were
+  measured once, along the way, and mean something only where the machine had nothing else to do.
 """
 
 

@@ -4,7 +4,7 @@
     thesis     the hyperparameters of the thesis's appendix, on plain correct code
     original   the same, with the quirks of the original implementation that explain its published figures
 
-Each has one column for the grid worlds and one for the reach tasks, as the thesis's appendix does. Beside them the default has a recipe for HinDRL in
+Each has settings for the grid worlds and others for the reach tasks, as the thesis's appendix does. Beside them the default has a recipe for HinDRL in
 tasks that are told anew in hindsight (`types.RetellableEnvironment`), such as ParameterizedReach. Environments of Gymnasium have the default only.
 """
 
@@ -21,7 +21,8 @@ from hindrl_jax.types import Environment
 Preset = Literal["default", "thesis", "original"]
 
 ORIGINAL_RULES: dict[str, dict[str, Any]] = {"grid": {"strict_order": False}, "reach": {"orientation": "axis_angle", "rotation_test": "axis_angle"}}
-"""Per family of environments, the arguments under which the original code ran: the last object wins alone, orientations jump."""
+"""Per family of environments, the arguments under which the original code ran: the last object wins alone, and orientations are axis-angles,
+which jump where the hand points down."""
 
 
 def preset(algo: Algorithm = "hindrl", name: Preset = "default", *, env: str | Environment = "FixedGridPickAndPlace") -> TrainConfig:
@@ -69,11 +70,12 @@ _ARM_AGENT = AgentConfig(
     bc_weight=0.03,
     final_bc_weight=0.0,
 )
-"""What both recipes for the arm have in common: less and less cloning and noise, and an actor that climbs the value relative to its size."""
+"""What both recipes for the arm have in common: clipped targets, cloning and a learning rate that fall, a long average of the actor, and an actor that
+climbs the value relative to its size. Each says for itself how far its target entropy falls."""
 
 
 def _default(algo: Algorithm, family: Family) -> TrainConfig:
-    """The project's own recipe; for the grid `TrainConfig()` for longer, and with a second life."""
+    """The project's own recipe. For the grid it is `TrainConfig()`, run for longer and with a second life."""
     encoding: Literal["standardised", "multiscale"] = "standardised" if family == "reach" else "multiscale"
     if algo == "bc":
         return TrainConfig(
@@ -96,12 +98,13 @@ def _default(algo: Algorithm, family: Family) -> TrainConfig:
         eval_episodes=20,
         batch=BatchConfig(n_step=10, gamma=0.99, bound_by_obtained_return=True),
         goal=GoalConfig(m=5, k=0.0),
+        # -4, not -8: with less noise the mean action comes to rest at the edge of a waypoint (docs/recipe.md)
         agent=dataclasses.replace(_ARM_AGENT, target_update_rate=0.01, final_target_entropy=-4.0, input_encoding=encoding),
     )
 
 
 def _retold() -> TrainConfig:
-    """The recipe where hindsight tells what has happened anew, see `types.RetellableEnvironment`: mostly that, and little cloning."""
+    """The recipe for a `types.RetellableEnvironment`: four rows told anew for each one as it was lived, and few demonstration rows."""
     return TrainConfig(
         steps=100_000,
         num_envs=16,

@@ -1,6 +1,6 @@
 """The Panda on MJX: the reference for `panda.control_step`, with MuJoCo's own equations in each of its 25 substeps.
 
-Same inverse kinematics; friction, drag, torque and joint limits as MuJoCo has them. Some fifty times slower on a CPU, and then only if compiled
+Same inverse kinematics; friction, drag, torque and joint limits as MuJoCo has them. Some forty times slower on a CPU, and then only if compiled
 with the environment's `compiler_options`.
 """
 

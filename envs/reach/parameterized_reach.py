@@ -79,7 +79,7 @@ class _Reach(abc.ABC):
     rotation_test: Literal["angle", "axis_angle"] = "angle"
     """What rotation_tolerance bounds: the angle between hand and waypoint, or the distance of their axis-angle vectors, as in the original code."""
     backend: Backend = "closed_form"
-    """Who simulates the arm: closed_form (for bulk training), mjx (MuJoCo's own equations in JAX, some fifty times slower), or robosuite (one
+    """Who simulates the arm: closed_form (for bulk training), mjx (MuJoCo's own equations in JAX, some forty times slower), or robosuite (one
     arm on the CPU, to record or to evaluate)."""
 
     def __post_init__(self):

@@ -29,7 +29,7 @@ class Ablation:
     tasks: tuple[str, ...] = ()
     """What to train on: fixed-1, fixed-5 or random-50, the fixed or the random grid with that many demonstrations (default: all)."""
     levers: tuple[str, ...] = ()
-    """The changes to train, next to the recipe as it is (default: all; --list shows them)."""
+    """The changes to train, next to the recipe without any (default: all; --list shows them)."""
     seeds: int = 16
     """Number of seeds, side by side; the same for all changes. With fewer than 8 or so the intervals are much too narrow."""
     seed: int = 2_000
