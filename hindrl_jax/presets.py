@@ -4,8 +4,8 @@
     thesis     the hyperparameters of the thesis's appendix, on plain correct code
     original   the same, with the quirks of the original implementation that explain its published figures
 
-Each has settings for the grid worlds and others for the reach tasks, as the thesis's appendix does. Beside them the default has a recipe for HinDRL in
-tasks that are told anew in hindsight (`types.RetellableEnvironment`), such as ParameterizedReach. Environments of Gymnasium have the default only.
+Each has settings for the grid worlds and others for the reach tasks, as the thesis's appendix does. Beside them the default has a recipe for HinDRL
+in tasks that are told anew in hindsight (`types.RetellableEnvironment`), such as ParameterizedReach. Environments of Gymnasium have the default only.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ _ARM_AGENT = AgentConfig(
     bc_weight=0.03,
     final_bc_weight=0.0,
 )
-"""What both recipes for the arm have in common: clipped targets, cloning and a learning rate that fall, a long average of the actor, and an actor that
-climbs the value relative to its size. Each says for itself how far its target entropy falls."""
+"""What both recipes for the arm have in common: clipped targets, cloning and a learning rate that fall, a long average of the actor, and an actor
+that climbs the value relative to its size. Each says for itself how far its target entropy falls."""
 
 
 def _default(algo: Algorithm, family: Family) -> TrainConfig:

@@ -109,6 +109,16 @@ def test_levers_have_names_for_directories_of_their_own():
     assert all(lever.group in get_args(ablation.Group) and lever.group != BASELINE.group for lever in LEVERS)
 
 
+def test_the_summaries_speak_of_the_recipe_as_it_is():
+    """They say "in place of 5" and the like by hand, so whoever changes the recipe must look at them."""
+    recipe = preset("hindrl")
+    batch, agent = recipe.batch, recipe.agent
+    assert (batch.n_step, batch.gamma, batch.max_demo_ratio, batch.num_sampled_goals, batch.batch_size) == (5, 0.98, 0.25, 0.25, 256)
+    assert (agent.num_critics, agent.target_update_rate, agent.bc_weight, agent.initial_alpha) == (2, 0.02, 0.01, 0.002)
+    assert (agent.target_entropy, agent.final_target_entropy, agent.actor_average_rate) == (-1.0, -10.0, 0.002)
+    assert (recipe.num_envs, recipe.updates_per_iteration) == (16, 2)
+
+
 def test_changes_are_made_at_once_and_may_depend_on_the_config():
     config = dataclasses.replace(TINY, steps=1_000)
     lever = Lever("both", "targets", "", (("algo", "tqcfd"), ("batch.num_sampled_goals", 0.0), ("batch.reach_zero", ablation.half_of_the_run)))
