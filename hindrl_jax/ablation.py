@@ -61,6 +61,18 @@ LEVERS: tuple[Lever, ...] = (
     Lever("sac", "algorithm", "SAC in place of TQC", (("agent.base", "sac"),)),
     Lever("td3", "algorithm", "TD3 in place of TQC, with its delayed actor", (("agent.base", "td3"), ("agent.actor_delay", 2))),
     Lever("ddpg", "algorithm", "DDPG in place of TQC, as DDPGfD and the HinDRL paper have it", (("agent.base", "ddpg"), ("agent.num_critics", 1))),
+    Lever(
+        "td3-preactivation",
+        "algorithm",
+        "as td3, with the mode before tanh kept small by a weight of 0.003 (HER)",
+        (("agent.base", "td3"), ("agent.actor_delay", 2), ("agent.preactivation_weight", 0.003)),
+    ),
+    Lever(
+        "ddpg-preactivation",
+        "algorithm",
+        "as ddpg, with the mode before tanh kept small by a weight of 0.003 (HER)",
+        (("agent.base", "ddpg"), ("agent.num_critics", 1), ("agent.preactivation_weight", 0.003)),
+    ),
     Lever("goals-final", "hindsight", "relabelled with the rollout's last goal (HER)", (("batch.hindrl_sampling_strategy", "final"),)),
     Lever("goals-future", "hindsight", "relabelled with goals later in the rollout (HER)", (("batch.hindrl_sampling_strategy", "future"),)),
     Lever("goals-episode", "hindsight", "relabelled with any goal of the rollout (HER)", (("batch.hindrl_sampling_strategy", "episode"),)),
@@ -167,6 +179,12 @@ LEVERS: tuple[Lever, ...] = (
     Lever("target-rate-0.005", "critic", "target critics follow at 0.005 in place of 0.02 (TQC)", (("agent.target_update_rate", 0.005),)),
     Lever("gradients-clipped", "critic", "gradients of actor and critics no longer than 1", (("agent.max_gradient_norm", 1.0),)),
     Lever("actor-delayed", "actor", "one gradient step of the actor for two of the critics (TD3)", (("agent.actor_delay", 2),)),
+    Lever(
+        "preactivation",
+        "actor",
+        "the mode before tanh kept small by a weight of 0.003 on its squared length (HER)",
+        (("agent.preactivation_weight", 0.003),),
+    ),
     Lever("alpha-1", "actor", "the entropy coefficient starts at 1 in place of 0.002 (SAC)", (("agent.initial_alpha", 1.0),)),
     Lever("entropy-constant", "actor", "the target entropy stays at -1, it does not fall to -10", (("agent.final_target_entropy", None),)),
     Lever(

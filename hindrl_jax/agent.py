@@ -228,9 +228,10 @@ def update(
 
     Critic: quantile Huber loss towards the truncated atoms of r + discount (Z' - alpha log pi(a' | s')); for algorithms without quantiles the
       squared error to r + discount (min Q' - alpha log pi(a' | s')).
-    Actor: mean(alpha log pi - value(s, a_pi)) + bc_weight * behaviour cloning loss; the value is the mean over critics and quantiles (tqc), the
-      least critic's (sac; with REDQ's subsets the mean over critics) or the first one's (td3, ddpg). With `normalise_value` or `relative_value` it
-      is divided by its size, and there is no alpha in the critics' targets, whose units are others.
+    Actor: mean(alpha log pi - value(s, a_pi)) + bc_weight * behaviour cloning loss + preactivation_weight * squared length of the mode before
+      tanh; the value is the mean over critics and quantiles (tqc), the least critic's (sac; with REDQ's subsets the mean over critics) or the
+      first one's (td3, ddpg). With `normalise_value` or `relative_value` it is divided by its size, and there is no alpha in the critics'
+      targets, whose units are others.
 
     Args:
       key: random key.
@@ -368,6 +369,8 @@ def _actor_gradient(state: AgentState, schedule: Schedule, config: AgentConfig, 
             clonable &= _value(state.critics, block.inputs, block.action, config) > own
         bc = behaviour_cloning(cloned, block.action, clonable, form=config.bc_loss)
         total = -jnp.exp(state.log_alpha) * entropy - _climbed(values, config) + schedule.bc_weight * bc
+        if config.preactivation_weight > 0.0:
+            total += config.preactivation_weight * jnp.mean(jnp.sum(jnp.square(distribution.mean), axis=0))
         return total, {"actor/loss": total, "actor/bc_loss": bc, "actor/value": value, "actor/entropy": entropy}
 
     return jax.grad(loss, has_aux=True)(state.actor)

@@ -186,7 +186,8 @@ class AgentConfig:
 
     base: Literal["tqc", "sac", "td3", "ddpg"] = "tqc"
     """The algorithm below the demonstrations: truncated quantile critics, soft actor-critic (Haarnoja et al., 2018), TD3 (Fujimoto et al., 2018;
-    there with actor_delay 2) or DDPG (Lillicrap et al., 2016; with one critic). Only tqc has quantiles, only tqc and sac have entropy."""
+    there with actor_delay 2) or DDPG (Lillicrap et al., 2016; with one critic). Only tqc has quantiles, only tqc and sac have entropy; td3 and
+    ddpg need a preactivation_weight."""
     net_arch: tuple[int, ...] = (64, 64, 64, 64)
     """Widths of the hidden layers, the same for actor and critics."""
     layer_norm: bool = False
@@ -236,6 +237,9 @@ class AgentConfig:
     relative_value: bool = False
     """Divide the value in the actor's loss, row by row, by itself, or by 0.01 where it is less (negative, too): as if the actor climbed the value's
     logarithm. One step lost then weighs alike near the reward and far from it. As with normalise_value, the critics' targets leave entropy out."""
+    preactivation_weight: float = 0.0
+    """Weight, in the actor's loss, of the squared length of the mode before tanh (HER, appendix A). Without entropy nothing else keeps td3 and ddpg
+    away from saturated actions, which have no gradient."""
     bc_weight: float = 0.01
     """Weight of the behaviour cloning loss on demonstration rows (lambda_BC of the thesis)."""
     final_bc_weight: float | None = None
@@ -278,6 +282,7 @@ class AgentConfig:
             exploration_noise=(self.exploration_noise >= 0.0, "0 or more"),
             target_noise=(self.target_noise >= 0.0, "0 or more"),
             target_noise_clip=(self.target_noise_clip >= 0.0, "0 or more"),
+            preactivation_weight=(self.preactivation_weight >= 0.0, "0 or more"),
             bc_weight=(self.bc_weight >= 0.0, "0 or more"),
             final_bc_weight=(self.final_bc_weight is None or self.final_bc_weight >= 0.0, "0 or more, or None"),
         )
@@ -424,8 +429,8 @@ _CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
         "demo_returns terminate_on_relabel bound_by_obtained_return timeouts_are_terminal importance_exponent demo_priority_bonus "
         "achieved_goal_ratio final_achieved_goal_ratio clip_targets num_critics num_target_critics num_quantiles top_quantiles_to_drop_per_net "
         "layer_norm target_update_rate initial_alpha target_entropy final_target_entropy actor_delay exploration_noise target_noise "
-        "target_noise_clip normalise_value relative_value bc_weight final_bc_weight agent_resets num_envs updates_per_iteration learning_starts "
-        "buffer_size demo_reset_ratio demo_reset_curriculum random_truncation",
+        "target_noise_clip normalise_value relative_value preactivation_weight bc_weight final_bc_weight agent_resets num_envs "
+        "updates_per_iteration learning_starts buffer_size demo_reset_ratio demo_reset_curriculum random_truncation",
         lambda config: config.algo != "bc",
         "behaviour cloning does not use it: choose another algo",
     ),

@@ -221,6 +221,14 @@ def test_relative_value_weighs_every_row_by_its_own_size(monkeypatch):
     np.testing.assert_allclose(slope, 0.5 * (1 / 0.5 + 1 / 0.25), rtol=1e-6)
 
 
+@pytest.mark.parametrize(("base", "weight", "expected"), [("ddpg", 0.0, 1.0), ("td3", 0.25, 0.731), ("ddpg", 0.25, 0.731), ("tqc", 0.25, 0.731)])
+def test_squared_preactivations_keep_the_actor_from_saturating(base, weight, expected):
+    # The reward is the action. Where the mode is tanh m, the loss weight m^2 - tanh m is least at 2 weight m = 1 - tanh^2 m: m = 0.93 for 1/4.
+    config = dataclasses.replace(BASES[base], preactivation_weight=weight)
+    states, _ = train(5, make_batch(action=ACTIONS, reward=ACTIONS[:, 0], discount=0.0), config)
+    np.testing.assert_allclose(mean_action(last(states), jnp.zeros((1, 2))), expected, atol=0.05)
+
+
 @pytest.mark.parametrize("name", ["normalise_value", "relative_value"])
 def test_targets_leave_entropy_out_where_its_weight_is_in_other_units(name):
     state = fresh_agent(jax.random.key(0)).replace(log_alpha=jnp.asarray(0.0))

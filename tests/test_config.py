@@ -106,6 +106,7 @@ BAD = [
     (AgentConfig, "target_noise_clip", [-0.1]),
     (AgentConfig, "normalise_value", [1]),
     (AgentConfig, "relative_value", [1]),
+    (AgentConfig, "preactivation_weight", [-0.1, None]),
     (AgentConfig, "final_bc_weight", [-1.0, float("nan")]),
     (AgentConfig, "q_filter", ["yes"]),
     (AgentConfig, "num_quantiles", [0]),
