@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import hindrl_jax
 from benchmarks import report, timing
 from benchmarks.timing import Contestant, Options, Row
-from hindrl_jax import rollout
-from hindrl_jax.goals import constant_goal
-from hindrl_jax.types import Array, Environment, action_to_env
+from hindrl_jax.base.environments import Environment, action_to_env
+from hindrl_jax.base.types import Array
+from hindrl_jax.core import rollout
+from hindrl_jax.core.goals import constant_goal
 
 TITLE = "Environment steps"
 ENVIRONMENTS = ("GridPickAndPlace", "FixedGridPickAndPlace")

@@ -11,13 +11,13 @@ import numpy as np
 import hindrl_jax
 from benchmarks import report, timing
 from benchmarks.timing import Contestant, Options, Row
-from hindrl_jax import train as training
+from hindrl_jax.base.errors import UserError
+from hindrl_jax.base.types import Episodes
 from hindrl_jax.config import TrainConfig
-from hindrl_jax.devices import spread
-from hindrl_jax.errors import UserError
-from hindrl_jax.from_gymnasium import GymnasiumEnv, Outcome, Simulators
-from hindrl_jax.host import HostPrograms
-from hindrl_jax.types import Episodes
+from hindrl_jax.core import train as training
+from hindrl_jax.tasks.from_gymnasium import GymnasiumEnv, Outcome, Simulators
+from hindrl_jax.training.devices import spread
+from hindrl_jax.training.host import HostPrograms
 
 TITLE = "Loop on the host"
 ENV = "gymnasium:FetchReach-v4"

@@ -12,13 +12,14 @@ import numpy as np
 from jax.sharding import Mesh
 
 import hindrl_jax
-from hindrl_jax import priorities, replay
-from hindrl_jax import train as training
+from hindrl_jax.base.environments import Environment
+from hindrl_jax.base.types import Array, Transition
 from hindrl_jax.config import BatchConfig, TrainConfig
-from hindrl_jax.devices import over_seeds, spread
-from hindrl_jax.priorities import Priorities
-from hindrl_jax.train import Guidance, TrainState
-from hindrl_jax.types import Array, Environment, Transition
+from hindrl_jax.core import priorities, replay
+from hindrl_jax.core import train as training
+from hindrl_jax.core.priorities import Priorities
+from hindrl_jax.core.train import Guidance, TrainState
+from hindrl_jax.training.devices import over_seeds, spread
 
 _RUN_ONCE = {"xla_backend_optimization_level": 0}  # for a program whose compilation takes longer than its one run
 

@@ -17,11 +17,11 @@ import jax.numpy as jnp
 from flax import struct
 
 from benchmarks import timing
-from hindrl_jax import agent as agents
-from hindrl_jax import networks
+from hindrl_jax.base.types import Array
 from hindrl_jax.config import AgentConfig
-from hindrl_jax.networks import Params
-from hindrl_jax.types import Array
+from hindrl_jax.core import agent as agents
+from hindrl_jax.core import networks
+from hindrl_jax.core.networks import Params
 
 _STEP_SIZE = 1e-9  # so small that the parameters stay what they are however long the benchmark runs
 

@@ -11,11 +11,11 @@ import numpy as np
 
 from benchmarks import report
 from benchmarks.timing import Options, Row, rounded
-from envs.reach import FixedParameterizedReach, mjx_dynamics, panda, rotations
-from experts.reach import ReachExpert
-from experts.robosuite_arm import RobosuiteArm
-from hindrl_jax.errors import UserError
-from hindrl_jax.types import Array
+from hindrl_jax.base.errors import UserError
+from hindrl_jax.base.types import Array
+from hindrl_jax.envs.reach import FixedParameterizedReach, mjx_dynamics, panda, rotations
+from hindrl_jax.experts.reach import ReachExpert
+from hindrl_jax.experts.robosuite_arm import RobosuiteArm
 
 TITLE = "Reaching, parity of the back ends"
 SEQUENCES = {

@@ -17,10 +17,10 @@ import numpy as np
 from benchmarks import report, timing
 from benchmarks.environments import stepper
 from benchmarks.timing import Contestant, Options, Row
-from envs.reach import FixedParameterizedReach, mjx_dynamics, panda
-from experts.robosuite_arm import RobosuiteArm
-from hindrl_jax.errors import UserError
-from hindrl_jax.types import Array
+from hindrl_jax.base.errors import UserError
+from hindrl_jax.base.types import Array
+from hindrl_jax.envs.reach import FixedParameterizedReach, mjx_dynamics, panda
+from hindrl_jax.experts.robosuite_arm import RobosuiteArm
 
 TITLE = "Reaching, control steps"
 WHO = {

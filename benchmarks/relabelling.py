@@ -10,8 +10,8 @@ import hindrl_jax
 from benchmarks import report, timing
 from benchmarks.loop import Loop, sampler, whole_episodes
 from benchmarks.timing import Contestant, Options, Row
-from hindrl_jax import goals
 from hindrl_jax.config import BatchConfig
+from hindrl_jax.core import goals
 
 TITLE = "Relabelling"
 STRATEGIES = ("final", "future", "episode", "random", "task_conditioned", "joint_union", "joint_intersection")

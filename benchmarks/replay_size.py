@@ -12,7 +12,7 @@ import hindrl_jax
 from benchmarks import report, timing
 from benchmarks.loop import Loop, prioritised_sampler, sampler, whole_episodes
 from benchmarks.timing import Options, Row
-from hindrl_jax.types import Environment
+from hindrl_jax.base.environments import Environment
 
 TITLE = "Replay size"
 SIZES = (10_000, 1_000_000)

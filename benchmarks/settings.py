@@ -7,8 +7,8 @@ import dataclasses
 import jax
 
 import hindrl_jax
-from hindrl_jax import agent as agents
 from hindrl_jax.config import TrainConfig
+from hindrl_jax.core import agent as agents
 
 
 @dataclasses.dataclass(frozen=True)

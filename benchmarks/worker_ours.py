@@ -20,10 +20,10 @@ import jax
 from benchmarks import passes, timing
 from benchmarks.loop import Loop, draw_batch, first_seed
 from benchmarks.settings import SETTINGS, Setting
-from hindrl_jax import agent as agents
-from hindrl_jax.agent import AgentState
-from hindrl_jax.train import Guidance, TrainState
-from hindrl_jax.types import Array, Transition
+from hindrl_jax.base.types import Array, Transition
+from hindrl_jax.core import agent as agents
+from hindrl_jax.core.agent import AgentState
+from hindrl_jax.core.train import Guidance, TrainState
 
 
 def whole_loop(setting: Setting) -> Callable[[], None]:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from flax import struct
 
 import hindrl_jax as hindrl
-from hindrl_jax.types import TimeStep
+from hindrl_jax.base.types import TimeStep
 
 
 @struct.dataclass(kw_only=True)

@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.reach import panda
-from experts.recording import on_host
-from experts.robosuite_arm import DeviceName, ReachEnvironment, RobosuiteArm, open_device, play_episode, stacked
-from hindrl_jax.errors import UserError
-from hindrl_jax.types import Array, Episodes
+from hindrl_jax.base.errors import UserError
+from hindrl_jax.base.types import Array, Episodes
+from hindrl_jax.envs.reach import panda
+from hindrl_jax.experts.robosuite_arm import DeviceName, ReachEnvironment, RobosuiteArm, open_device, play_episode, stacked
+from hindrl_jax.training.recording import on_host
 
 FULL_TRANSLATION, FULL_ROTATION = 0.05, 0.5  # m and rad that robosuite's default controller makes of a device's 1
 CONTROLS = {

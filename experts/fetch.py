@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from hindrl_jax.checks import check, check_types
+from hindrl_jax.base.checks import check, check_types
 
 _STEP = 0.05  # m, the displacement of an action of 1
 _BEHIND = 0.5  # share of a commanded displacement that the arm makes within the step, more or less

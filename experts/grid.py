@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
-from envs.grid.pick_and_place import FixedGridPickAndPlace, GridPickAndPlace, GridState
-from hindrl_jax.checks import check_types
-from hindrl_jax.types import Array
+from hindrl_jax.base.checks import check_types
+from hindrl_jax.base.types import Array
+from hindrl_jax.envs.grid.pick_and_place import FixedGridPickAndPlace, GridPickAndPlace, GridState
 
 
 @dataclass(frozen=True)

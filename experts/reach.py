@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
-from envs.reach import FixedParameterizedReach, ParameterizedReach, ReachState, panda, rotations
-from hindrl_jax.checks import check, check_types
-from hindrl_jax.types import Array
+from hindrl_jax.base.checks import check, check_types
+from hindrl_jax.base.types import Array
+from hindrl_jax.envs.reach import FixedParameterizedReach, ParameterizedReach, ReachState, panda, rotations
 
 
 @dataclass(frozen=True)

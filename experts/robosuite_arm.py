@@ -2,7 +2,7 @@
 
 Everything about robosuite is in this module. It only moves the arm: waypoints and start come from `env.reset`; observation, reward and progress
 from `env.arrive`, as with the other back ends. The controller is robosuite's IK_POSE at 20 Hz, with its broken default input type put right;
-`envs.reach.panda` restates it.
+`hindrl_jax.envs.reach.panda` restates it.
 
 robosuite takes seconds to import and half a gigabyte of disk, so it is optional and imported only when an arm is asked for.
 """
@@ -26,10 +26,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.reach import panda
-from envs.reach.parameterized_reach import FixedParameterizedReach, ParameterizedReach, ReachState
-from hindrl_jax.errors import UserError, one_line
-from hindrl_jax.types import Array, Episodes, TimeStep, action_from_env
+from hindrl_jax.base.environments import action_from_env
+from hindrl_jax.base.errors import UserError, one_line
+from hindrl_jax.base.types import Array, Episodes, TimeStep
+from hindrl_jax.envs.reach import panda
+from hindrl_jax.envs.reach.parameterized_reach import FixedParameterizedReach, ParameterizedReach, ReachState
 
 ReachEnvironment = FixedParameterizedReach | ParameterizedReach
 Act = Callable[[Array, ReachState, Array], Array]
@@ -329,7 +330,7 @@ def shared_arm(num_waypoints: int) -> RobosuiteArm:
 
 
 def play_in_robosuite(key: Array, env: ReachEnvironment, act: Act, num_episodes: int) -> Episodes:
-    """`experts.recording.play`, with the arm in robosuite: equal keys give the same starts, waypoints and keys for `act`.
+    """`hindrl_jax.experts.recording.play`, with the arm in robosuite: equal keys give the same starts, waypoints and keys for `act`.
 
     One episode after the other, on the host. `act` is compiled once, however often this is called with it.
 

@@ -21,28 +21,28 @@ STARTED = time.perf_counter()  # this package loads before the large ones it use
 
 # Loaded on first use: `envs` and `experts` import the core below this package, and the names here import `envs` and `experts`.
 _EXPORTS = {
-    "Checkpoints": "hindrl_jax.checkpoints",
-    "ProgressBar": "hindrl_jax.progress",
-    "Result": "hindrl_jax.experiment",
-    "TensorBoardReporter": "hindrl_jax.reporters",
-    "UserError": "hindrl_jax.errors",
-    "WandbReporter": "hindrl_jax.reporters",
-    "fit": "hindrl_jax.experiment",
-    "load_demonstrations": "hindrl_jax.datasets",
-    "load_run": "hindrl_jax.runs",
-    "make": "hindrl_jax.registry",
-    "preset": "hindrl_jax.presets",
-    "record_demonstrations": "hindrl_jax.experiment",
-    "record_gymnasium": "hindrl_jax.host",
-    "register": "hindrl_jax.registry",
-    "save_demonstrations": "hindrl_jax.datasets",
-    "save_run": "hindrl_jax.runs",
+    "Checkpoints": "hindrl_jax.runs.checkpoints",
+    "ProgressBar": "hindrl_jax.reporting.progress",
+    "Result": "hindrl_jax.training.experiment",
+    "TensorBoardReporter": "hindrl_jax.reporting.reporters",
+    "UserError": "hindrl_jax.base.errors",
+    "WandbReporter": "hindrl_jax.reporting.reporters",
+    "fit": "hindrl_jax.training.experiment",
+    "load_demonstrations": "hindrl_jax.demonstrations.hdf5",
+    "load_run": "hindrl_jax.runs.reader",
+    "make": "hindrl_jax.tasks.registry",
+    "preset": "hindrl_jax.tasks.presets",
+    "record_demonstrations": "hindrl_jax.training.experiment",
+    "record_gymnasium": "hindrl_jax.training.host",
+    "register": "hindrl_jax.tasks.registry",
+    "save_demonstrations": "hindrl_jax.demonstrations.hdf5",
+    "save_run": "hindrl_jax.runs.writer",
 }
 
 __all__ = ["__version__", *_EXPORTS]
 
 
-importlib.import_module("hindrl_jax.registration").register()  # so that `gymnasium.make("hindrl/...")` finds our environments
+importlib.import_module("hindrl_jax.tasks.ids").register()  # so that `gymnasium.make("hindrl/...")` finds our environments
 
 
 def __getattr__(name: str) -> Any:

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hindrl_jax import agent as agents
+from hindrl_jax.base.types import Transition
 from hindrl_jax.config import AgentConfig
-from hindrl_jax.networks import apply_critics
-from hindrl_jax.types import Transition
+from hindrl_jax.core import agent as agents
+from hindrl_jax.core.networks import apply_critics
 
 # The entropy coefficient starts at e^-9 and aims far below the policy's entropy, so that it only falls: values are those of the plain return.
 CONFIG = AgentConfig(

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from hindrl_jax.types import Array, Episodes, TimeStep
+from hindrl_jax.base.types import Array, Episodes, TimeStep
 
 
 @struct.dataclass(kw_only=True)

@@ -1,5 +1,5 @@
 """Grid worlds (thesis section 3.1)."""
 
-from envs.grid.pick_and_place import FixedGridPickAndPlace, GridPickAndPlace, GridState
+from hindrl_jax.envs.grid.pick_and_place import FixedGridPickAndPlace, GridPickAndPlace, GridState
 
 __all__ = ["FixedGridPickAndPlace", "GridPickAndPlace", "GridState"]

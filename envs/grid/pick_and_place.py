@@ -25,8 +25,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from hindrl_jax.checks import check_types
-from hindrl_jax.types import Array, TimeStep
+from hindrl_jax.base.checks import check_types
+from hindrl_jax.base.types import Array, TimeStep
 
 Box = tuple[tuple[int, int], tuple[int, int]]  # lowest and highest (x, y), both inside the box
 

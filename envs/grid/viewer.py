@@ -11,8 +11,8 @@ from os import PathLike
 import numpy as np
 from PIL import Image, ImageDraw
 
-from envs import drawing
-from envs.grid.pick_and_place import FixedGridPickAndPlace, GridPickAndPlace, GridState
+from hindrl_jax.envs import drawing
+from hindrl_jax.envs.grid.pick_and_place import FixedGridPickAndPlace, GridPickAndPlace, GridState
 
 _MIN_CELL = 48  # pixels
 _MIN_WIDTH = 360  # pixels, so that the caption fits beside small grids

@@ -1,5 +1,5 @@
 """Reaching with a Panda arm (thesis sections 3.2.1 and 3.2.2)."""
 
-from envs.reach.parameterized_reach import FixedParameterizedReach, ParameterizedReach, ReachState
+from hindrl_jax.envs.reach.parameterized_reach import FixedParameterizedReach, ParameterizedReach, ReachState
 
 __all__ = ["FixedParameterizedReach", "ParameterizedReach", "ReachState"]

@@ -14,8 +14,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from envs.reach import panda
-from hindrl_jax.types import Array
+from hindrl_jax.base.types import Array
+from hindrl_jax.envs.reach import panda
 
 
 @functools.cache

@@ -24,8 +24,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hindrl_jax.errors import UserError, one_line
-from hindrl_jax.types import Array
+from hindrl_jax.base.errors import UserError, one_line
+from hindrl_jax.base.types import Array
 
 MODEL_PATH = Path(__file__).with_name("panda.xml")
 NUM_JOINTS = 7

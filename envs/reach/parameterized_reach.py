@@ -25,9 +25,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs.reach import mjx_dynamics, panda, rotations
-from hindrl_jax.checks import check, check_types
-from hindrl_jax.types import Array, TimeStep
+from hindrl_jax.base.checks import check, check_types
+from hindrl_jax.base.types import Array, TimeStep
+from hindrl_jax.envs.reach import mjx_dynamics, panda, rotations
 
 Backend = Literal["closed_form", "mjx", "robosuite"]
 

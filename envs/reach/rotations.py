@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from hindrl_jax.types import Array
+from hindrl_jax.base.types import Array
 
 
 def from_rotation_vector(vector: Array) -> Array:

@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw
 
-from envs import drawing
-from envs.reach import panda
-from envs.reach.parameterized_reach import FixedParameterizedReach, ParameterizedReach, ReachState
-from hindrl_jax.errors import UserError
+from hindrl_jax.base.errors import UserError
+from hindrl_jax.envs import drawing
+from hindrl_jax.envs.reach import panda
+from hindrl_jax.envs.reach.parameterized_reach import FixedParameterizedReach, ParameterizedReach, ReachState
 
 mujoco = panda.import_mujoco()
 

@@ -15,9 +15,9 @@ from typing import Any
 import jax
 
 from hindrl_jax import __version__
+from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.cli import comparison, demonstrations, environments, playing, reproduction, training
-from hindrl_jax.errors import UserError, one_line
-from hindrl_jax.registry import did_you_mean
+from hindrl_jax.tasks.registry import did_you_mean
 
 Command = Callable[[list[str]], None]
 COMMANDS: dict[str, Command | dict[str, Command]] = {

@@ -12,8 +12,8 @@ import jax
 import tyro
 from rich.console import Console
 
-from hindrl_jax.errors import UserError
-from hindrl_jax.registry import TASKS
+from hindrl_jax.base.errors import UserError
+from hindrl_jax.tasks.registry import TASKS
 
 _TYRO = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
 ENV_HELP = "The environment; `hindrl envs` lists them. Any goal-conditioned one of Gymnasium is gymnasium:ID, as in gymnasium:FetchReach-v4."

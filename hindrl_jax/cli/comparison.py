@@ -12,13 +12,13 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from hindrl_jax import plots
+from hindrl_jax.base.errors import UserError
+from hindrl_jax.base.files import disk_trouble
 from hindrl_jax.cli.common import console, parse
-from hindrl_jax.comparison import Axis, Comparison, changes, find_runs, read_runs, remarks, write_csv
-from hindrl_jax.comparison import compare as compared_runs
-from hindrl_jax.errors import UserError
-from hindrl_jax.runs import disk_trouble
-from hindrl_jax.statistics import Interval
+from hindrl_jax.plotting import curves as plots
+from hindrl_jax.plotting.statistics import Interval
+from hindrl_jax.reporting.compare import Axis, Comparison, changes, find_runs, read_runs, remarks, write_csv
+from hindrl_jax.reporting.compare import compare as compared_runs
 
 _MOST_CHANGES = 6  # that are named for each run
 _TABLE_WIDTH = 160  # at most, also where the terminal is narrower: a cell in two lines is hard to compare

@@ -15,11 +15,13 @@ import tyro
 from rich import box
 from rich.table import Table
 
-from experts.by_hand import record_by_hand
-from experts.recording import on_host
-from experts.robosuite_arm import DeviceName
+from hindrl_jax.base.environments import RestorableEnvironment
+from hindrl_jax.base.errors import UserError
+from hindrl_jax.base.files import check_can_write, disk_trouble
+from hindrl_jax.base.types import Episodes
 from hindrl_jax.cli.common import ENV_HELP, console, counted, env_names, episode_key, parse, peek
-from hindrl_jax.conversion import (
+from hindrl_jax.core.goals import epsilon_filter, epsilon_from_demonstrations, goal_table
+from hindrl_jax.demonstrations.convert import (
     MINARI_PREFIX,
     ForeignRecording,
     Interpretation,
@@ -31,14 +33,14 @@ from hindrl_jax.conversion import (
     understand,
     write,
 )
-from hindrl_jax.datasets import Recording, check_can_write, padded, save_demonstrations, summarise_recording
-from hindrl_jax.errors import UserError
-from hindrl_jax.experiment import record_demonstrations
-from hindrl_jax.goals import epsilon_filter, epsilon_from_demonstrations, goal_table
-from hindrl_jax.plots import save_filter
-from hindrl_jax.registry import TASKS, make, task
-from hindrl_jax.runs import disk_trouble, draw_episodes
-from hindrl_jax.types import Episodes, RestorableEnvironment
+from hindrl_jax.demonstrations.hdf5 import Recording, padded, save_demonstrations, summarise_recording
+from hindrl_jax.experts.by_hand import record_by_hand
+from hindrl_jax.experts.robosuite_arm import DeviceName
+from hindrl_jax.plotting.curves import save_filter
+from hindrl_jax.runs.reader import draw_episodes
+from hindrl_jax.tasks.registry import TASKS, make, task
+from hindrl_jax.training.experiment import record_demonstrations
+from hindrl_jax.training.recording import on_host
 
 
 @dataclasses.dataclass(frozen=True)

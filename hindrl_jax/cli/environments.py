@@ -7,10 +7,10 @@ import dataclasses
 from rich import box
 from rich.table import Table
 
+from hindrl_jax.base.environments import RestorableEnvironment
 from hindrl_jax.cli.common import console, parse
-from hindrl_jax.from_gymnasium import GymnasiumEnv
-from hindrl_jax.registry import TASKS
-from hindrl_jax.types import RestorableEnvironment
+from hindrl_jax.tasks.from_gymnasium import GymnasiumEnv
+from hindrl_jax.tasks.registry import TASKS
 
 
 def show(arguments: list[str]) -> None:

@@ -11,10 +11,10 @@ from rich import box
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from experts.recording import on_host
+from hindrl_jax.base.errors import UserError
 from hindrl_jax.cli.common import console, counted, episode_key, parse
-from hindrl_jax.errors import UserError
-from hindrl_jax.runs import load_run
+from hindrl_jax.runs.reader import load_run
+from hindrl_jax.training.recording import on_host
 
 
 @dataclasses.dataclass(frozen=True)

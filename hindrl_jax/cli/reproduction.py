@@ -13,11 +13,11 @@ from rich import box
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from hindrl_jax import ablation
+from hindrl_jax.base.errors import UserError
 from hindrl_jax.cli.common import console, counted, parse, seeds_from
-from hindrl_jax.errors import UserError
-from hindrl_jax.experiment import Result, steps_to_learn
-from hindrl_jax.registry import did_you_mean
+from hindrl_jax.reproduction import ablation
+from hindrl_jax.tasks.registry import did_you_mean
+from hindrl_jax.training.experiment import Result, steps_to_learn
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +83,7 @@ def ablate(arguments: list[str]) -> None:
 
 
 def _bars() -> Progress:
-    """A place for the bars of trainings that follow each other; `hindrl_jax.progress` has that of a single one."""
+    """A place for the bars of trainings that follow each other; `hindrl_jax.reporting.progress` has that of a single one."""
     columns = ("{task.description}", BarColumn(), "{task.completed:,.0f}/{task.total:,.0f} steps", "{task.fields[rates]}", "left")
     return Progress(*(TextColumn(c) if isinstance(c, str) else c for c in columns), TimeRemainingColumn(), console=console, transient=True)
 

@@ -22,18 +22,20 @@ from rich import box
 from rich.table import Table
 
 from hindrl_jax import STARTED
-from hindrl_jax.checkpoints import Checkpoints
+from hindrl_jax.base.errors import UserError, one_line
+from hindrl_jax.base.types import Episodes
 from hindrl_jax.cli.common import ENV_HELP, console, counted, env_names, parse, peek, seeds_from
 from hindrl_jax.config import SWEEPABLE, TrainConfig, without_effect
-from hindrl_jax.conversion import MINARI_PREFIX, load
-from hindrl_jax.errors import UserError, one_line
-from hindrl_jax.experiment import Diverged, Result, check_config, check_trainable, fit, record_demonstrations
-from hindrl_jax.presets import ORIGINAL_RULES, Preset, preset
-from hindrl_jax.progress import ProgressBar
-from hindrl_jax.registry import checked, did_you_mean, make, task
-from hindrl_jax.reporters import REPORTERS, Reporter
-from hindrl_jax.runs import CHECKPOINTS, FROM_PYTHON, SUMMARY, SWEEP, RunSpec, RunWriter, SweepWriter, read_spec, read_sweep, summarise
-from hindrl_jax.types import Episodes
+from hindrl_jax.demonstrations.convert import MINARI_PREFIX, load
+from hindrl_jax.reporting.progress import ProgressBar
+from hindrl_jax.reporting.reporters import REPORTERS, Reporter
+from hindrl_jax.runs.checkpoints import Checkpoints
+from hindrl_jax.runs.spec import CHECKPOINTS, FROM_PYTHON, SUMMARY, SWEEP, RunSpec, read_spec
+from hindrl_jax.runs.sweep import SweepWriter, read_sweep
+from hindrl_jax.runs.writer import RunWriter, summarise
+from hindrl_jax.tasks.presets import ORIGINAL_RULES, Preset, preset
+from hindrl_jax.tasks.registry import checked, did_you_mean, make, task
+from hindrl_jax.training.experiment import Diverged, Result, check_config, check_trainable, fit, record_demonstrations
 
 
 @dataclasses.dataclass(frozen=True)

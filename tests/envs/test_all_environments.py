@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs.grid import FixedGridPickAndPlace, GridPickAndPlace
-from envs.reach import FixedParameterizedReach, ParameterizedReach
-from hindrl_jax.types import RestorableEnvironment
+from hindrl_jax.base.environments import RestorableEnvironment
+from hindrl_jax.envs.grid import FixedGridPickAndPlace, GridPickAndPlace
+from hindrl_jax.envs.reach import FixedParameterizedReach, ParameterizedReach
 
 ENVIRONMENTS = [
     GridPickAndPlace(),

@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from envs.reach import ParameterizedReach, panda
-from hindrl_jax.types import compiler_options
+from hindrl_jax.base.environments import compiler_options
+from hindrl_jax.envs.reach import ParameterizedReach, panda
 
 LIMITS = np.array(3 * [panda.MAX_TRANSLATION] + 3 * [panda.MAX_ROTATION])
 START = np.float32(panda.INITIAL_JOINTS) + np.float32(np.random.default_rng(1).normal(0, 0.02, 7))  # rad
@@ -364,7 +364,7 @@ def theirs():
     """robosuite's compiled model of its whole scene, and data at the initial configuration with closed fingers."""
     if importlib.util.find_spec("robosuite") is None:  # importorskip would import it, with all its side effects
         pytest.skip("robosuite is not installed")
-    from experts.robosuite_arm import shared_arm
+    from hindrl_jax.experts.robosuite_arm import shared_arm
 
     arm = shared_arm(2)
     arm.reset(np.array(panda.INITIAL_JOINTS))

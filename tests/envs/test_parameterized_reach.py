@@ -12,7 +12,7 @@ import pytest
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from envs.reach import FixedParameterizedReach, ParameterizedReach, ReachState, panda, rotations
+from hindrl_jax.envs.reach import FixedParameterizedReach, ParameterizedReach, ReachState, panda, rotations
 
 BOTH_TASKS = pytest.mark.parametrize("task", [FixedParameterizedReach, ParameterizedReach])
 FAR = (0.0, 0.1, 0.0)  # m

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs.grid.pick_and_place import FixedGridPickAndPlace, GridPickAndPlace, GridState, _free_rank
+from hindrl_jax.envs.grid.pick_and_place import FixedGridPickAndPlace, GridPickAndPlace, GridState, _free_rank
 
 RIGHT, DOWN, LEFT, UP = range(4)  # +x, +y, -x, -y
 BOTH_TASKS = pytest.mark.parametrize("task", [GridPickAndPlace, FixedGridPickAndPlace])

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from envs import drawing
-from envs.reach import FixedParameterizedReach, ParameterizedReach, ReachState, panda, viewer
-from hindrl_jax.errors import UserError
+from hindrl_jax.base.errors import UserError
+from hindrl_jax.envs import drawing
+from hindrl_jax.envs.reach import FixedParameterizedReach, ParameterizedReach, ReachState, panda, viewer
 
 DOWN = np.diag([1.0, -1.0, -1.0])  # a hand that points straight down
 LEFT, MIDDLE, RIGHT = (0.5, -0.25, 0.25), (0.6, 0.0, 0.35), (0.5, 0.28, 0.15)  # m, as seen from the camera, clear of the arm
@@ -348,7 +348,7 @@ def test_choice_of_the_opengl_library(monkeypatch, egl, display, wish, expected)
 def test_a_process_that_has_drawn_ends_quietly():
     program = """
 import numpy as np
-from envs.reach import panda, viewer
+from hindrl_jax.envs.reach import panda, viewer
 viewer._model = panda.model
 viewer._stage().pose(np.zeros(7))
 viewer._stage().render()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from envs.grid import FixedGridPickAndPlace, GridPickAndPlace, GridState, viewer
+from hindrl_jax.envs.grid import FixedGridPickAndPlace, GridPickAndPlace, GridState, viewer
 
 
 def place(agent, objects, goal, *, num_delivered=0, held=-1, step=0):

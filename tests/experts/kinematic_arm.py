@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.reach import FixedParameterizedReach, panda
+from hindrl_jax.envs.reach import FixedParameterizedReach, panda
 
 
 def control_step(joints, rest, command):

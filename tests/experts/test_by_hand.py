@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from kinematic_arm import KinematicArm
 
-from envs.reach import FixedParameterizedReach
-from experts import by_hand, robosuite_arm
-from experts.by_hand import command_of, record_by_hand, record_with
-from experts.reach import ReachExpert
-from experts.robosuite_arm import play_episode
-from hindrl_jax.errors import UserError
-from hindrl_jax.types import action_to_env
+from hindrl_jax.base.environments import action_to_env
+from hindrl_jax.base.errors import UserError
+from hindrl_jax.envs.reach import FixedParameterizedReach
+from hindrl_jax.experts import by_hand, robosuite_arm
+from hindrl_jax.experts.by_hand import command_of, record_by_hand, record_with
+from hindrl_jax.experts.reach import ReachExpert
+from hindrl_jax.experts.robosuite_arm import play_episode
 
 # Every episode of this task is the same: a fixed start, and one fixed waypoint, which is reached within 20 steps or so.
 ENV = FixedParameterizedReach(num_waypoints=1, horizon=40, joint_noise=0.0, position_tolerance=0.1, rotation_tolerance=0.3, backend="robosuite")

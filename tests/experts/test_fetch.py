@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import hindrl_jax as hindrl
-from experts.fetch import FetchPickAndPlaceExpert, FetchReachExpert
-from hindrl_jax.errors import UserError
-from hindrl_jax.from_gymnasium import Simulators
-from hindrl_jax.registry import task
+from hindrl_jax.base.errors import UserError
+from hindrl_jax.experts.fetch import FetchPickAndPlaceExpert, FetchReachExpert
+from hindrl_jax.tasks.from_gymnasium import Simulators
+from hindrl_jax.tasks.registry import task
 
 pytest.importorskip("gymnasium_robotics")
 

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs.grid import FixedGridPickAndPlace, GridPickAndPlace, GridState
-from experts.grid import GridExpert
+from hindrl_jax.envs.grid import FixedGridPickAndPlace, GridPickAndPlace, GridState
+from hindrl_jax.experts.grid import GridExpert
 
 RIGHT, DOWN, LEFT, UP = range(4)  # +x, +y, -x, -y
 EXACT = GridExpert(random_action_probability=0.0)

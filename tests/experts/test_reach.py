@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs.reach import FixedParameterizedReach, ParameterizedReach, panda, rotations
-from experts.reach import ReachExpert
-from experts.recording import play
-from hindrl_jax.types import action_to_env
+from hindrl_jax.base.environments import action_to_env
+from hindrl_jax.envs.reach import FixedParameterizedReach, ParameterizedReach, panda, rotations
+from hindrl_jax.experts.reach import ReachExpert
+from hindrl_jax.training.recording import play
 
 ENV = FixedParameterizedReach()
 HAND = panda.posture(jnp.asarray(panda.INITIAL_JOINTS, jnp.float32))

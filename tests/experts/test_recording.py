@@ -6,11 +6,11 @@ import jax
 import numpy as np
 import pytest
 
-from envs.grid import FixedGridPickAndPlace
-from experts.grid import GridExpert
-from experts.recording import record
-from hindrl_jax.errors import UserError
-from hindrl_jax.types import action_to_env
+from hindrl_jax.base.environments import action_to_env
+from hindrl_jax.base.errors import UserError
+from hindrl_jax.envs.grid import FixedGridPickAndPlace
+from hindrl_jax.experts.grid import GridExpert
+from hindrl_jax.training.recording import record
 
 ENV = FixedGridPickAndPlace(size=6, num_objects=2, horizon=40)
 

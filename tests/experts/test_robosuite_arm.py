@@ -18,22 +18,24 @@ import pytest
 from commands import refusal
 from kinematic_arm import KinematicArm, KinematicReach
 
-from envs.reach import FixedParameterizedReach, panda, rotations
-from experts import robosuite_arm
-from experts.reach import ReachExpert
-from experts.recording import play, record
-from experts.robosuite_arm import RobosuiteArm, check_versions, play_episode, play_in_robosuite, shared_arm, stacked
-from hindrl_jax import agent as agents
-from hindrl_jax import cli, runs
+from hindrl_jax import cli
+from hindrl_jax.base.environments import action_to_env
+from hindrl_jax.base.errors import UserError
 from hindrl_jax.config import AgentConfig, TrainConfig
-from hindrl_jax.datasets import describe_demonstrations, load_demonstrations, save_demonstrations
-from hindrl_jax.errors import UserError
-from hindrl_jax.experiment import fit
-from hindrl_jax.goals import GoalTable
-from hindrl_jax.registry import make
-from hindrl_jax.runs import Run, RunSpec, load_run
-from hindrl_jax.train import make_policy
-from hindrl_jax.types import action_to_env
+from hindrl_jax.core import agent as agents
+from hindrl_jax.core.goals import GoalTable
+from hindrl_jax.core.train import make_policy
+from hindrl_jax.demonstrations.hdf5 import describe_demonstrations, load_demonstrations, save_demonstrations
+from hindrl_jax.envs.reach import FixedParameterizedReach, panda, rotations
+from hindrl_jax.experts import robosuite_arm
+from hindrl_jax.experts.reach import ReachExpert
+from hindrl_jax.experts.robosuite_arm import RobosuiteArm, check_versions, play_episode, play_in_robosuite, shared_arm, stacked
+from hindrl_jax.runs import writer as runs
+from hindrl_jax.runs.reader import Run, load_run
+from hindrl_jax.runs.spec import RunSpec
+from hindrl_jax.tasks.registry import make
+from hindrl_jax.training.experiment import fit
+from hindrl_jax.training.recording import play, record
 
 ENV = FixedParameterizedReach(num_waypoints=2, backend="robosuite")
 IN_CLOSED_FORM = dataclasses.replace(ENV, backend="closed_form")
@@ -449,7 +451,7 @@ def test_robosuite_says_nothing(arm):
     """In a process of its own, where it is imported for the first time and warnings are errors."""
     code = (
         "import numpy as np, os\n"
-        "from experts.robosuite_arm import RobosuiteArm\n"
+        "from hindrl_jax.experts.robosuite_arm import RobosuiteArm\n"
         "arm = RobosuiteArm(1)\n"
         "arm.reset(np.zeros(7)), arm.step(np.zeros(6))\n"
         "print('MUJOCO_GL' in os.environ)"

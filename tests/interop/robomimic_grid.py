@@ -20,9 +20,9 @@ import robomimic.utils.env_utils as env_utils
 from robomimic.scripts.dataset_states_to_obs import dataset_states_to_obs
 from robomimic.scripts.split_train_val import split_train_val_from_hdf5
 
-from hindrl_jax.datasets import read_recording
-from hindrl_jax.registry import make
-from hindrl_jax.types import action_to_env
+from hindrl_jax.base.environments import action_to_env
+from hindrl_jax.demonstrations.hdf5 import read_recording
+from hindrl_jax.tasks.registry import make
 
 KEYS = ("objects", "goal", "delivered", "held")
 """Modalities that together, in this order, are the observation of the grid tasks."""

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from hindrl_jax import cli
-from hindrl_jax.datasets import load_demonstrations, read_recording
-from hindrl_jax.registry import make
+from hindrl_jax.demonstrations.hdf5 import load_demonstrations, read_recording
+from hindrl_jax.tasks.registry import make
 
 pytest.importorskip("robomimic", reason="robomimic is not installed: make test-interop")
 pytestmark = pytest.mark.filterwarnings("ignore")  # robomimic and what it imports are of another time

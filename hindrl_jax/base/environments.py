@@ -1,0 +1,119 @@
+"""What an environment is, and what it may be able to do beyond that."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Protocol, runtime_checkable
+
+import jax.numpy as jnp
+
+from hindrl_jax.base.types import Array, TimeStep
+
+
+@runtime_checkable
+class Environment(Protocol):
+    """A goal-conditioned task as pure functions. Implementations are frozen dataclasses: hashable, and static under `jax.jit`.
+
+    `reset` and `step` are unbatched; the caller applies `jax.vmap`. The state is any pytree and carries its own random key.
+    """
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    def __hash__(self) -> int: ...
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def horizon(self) -> int:
+        """Number of steps after which an episode is truncated."""
+
+    @property
+    def observation_dim(self) -> int: ...
+
+    @property
+    def goal_dim(self) -> int: ...
+
+    @property
+    def action_dim(self) -> int: ...
+
+    @property
+    def action_low(self) -> Any:
+        """Lower bound of the actions in the environment's own units: a number for all dimensions, or (A,)."""
+
+    @property
+    def action_high(self) -> Any:
+        """Upper bound, likewise."""
+
+    def reset(self, key: Array) -> tuple[Any, Array]:
+        """Starts an episode: key -> (state, observation (D,))."""
+
+    def step(self, state: Any, action: Array) -> tuple[Any, TimeStep]:
+        """Takes one step: action (A,) in the environment's own units, clipped to its bounds."""
+
+    def achieved_goal(self, observation: Array) -> Array:
+        """The projection Phi of thesis section 2.2: observations (..., D) -> achieved goals (..., G)."""
+
+    def task_goal(self) -> Array:
+        """(G,) one fixed goal that stands for "the task is solved"."""
+
+
+def compiler_options(env: Environment) -> dict[str, Any]:
+    """Options that XLA needs for programs that step this environment, for `jax.jit` or `compile`; most environments need none."""
+    return getattr(env, "compiler_options", {})
+
+
+@runtime_checkable
+class RestorableEnvironment(Environment, Protocol):
+    """An environment whose state can be written down as a vector and read back: to be drawn, or to begin an episode there."""
+
+    @property
+    def state_dim(self) -> int:
+        """S, the length of the vector."""
+
+    def observe(self, state: Any) -> Array:
+        """The observation (D,) of a state."""
+
+    def state_to_vector(self, state: Any) -> Array:
+        """(S,) float32: all of the state but its key."""
+
+    def vector_to_state(self, key: Array, vector: Array) -> Any:
+        """The state of a vector (S,), with this key."""
+
+
+@runtime_checkable
+class RetellableEnvironment(Environment, Protocol):
+    """An environment whose observations say what an episode is about, and whose motion does not depend on that: what has happened can be told
+    again as though the episode had been about something else. Hindsight then changes observations in place of goals."""
+
+    @property
+    def num_subgoals(self) -> int:
+        """J, how many states one story is about."""
+
+    def retell(self, key: Array, observations: Array, subgoals: Array) -> tuple[Array, Array]:
+        """What would have been seen, had the episode been about other states.
+
+        Args:
+          key: random key.
+          observations: (n + 1, D) of states that follow each other, the task not solved in the first.
+          subgoals: (J, D) observations of the states that it is now about, in the order in which they are to be reached.
+
+        Returns:
+          The observations anew, and (n,) bool for each but the first, whether the task is solved there.
+        """
+
+
+def action_to_env(action: Array, env: Environment) -> Array:
+    """Maps policy actions (..., A) in [-1, 1] to the environment's own units."""
+    low, high = _action_bounds(action, env)
+    return low + (action + 1.0) * (0.5 * (high - low))
+
+
+def action_from_env(action: Array, env: Environment) -> Array:
+    """Maps actions (..., A) in the environment's own units to the policy's [-1, 1]; the inverse of `action_to_env`."""
+    low, high = _action_bounds(action, env)
+    return 2.0 * (action - low) / (high - low) - 1.0
+
+
+def _action_bounds(action: Array, env: Environment) -> tuple[Array, Array]:
+    low, high = (jnp.broadcast_to(jnp.asarray(bound, action.dtype), action.shape) for bound in (env.action_low, env.action_high))
+    return low, high

@@ -1,0 +1,154 @@
+"""Actor and critic networks. The one module that knows flax.linen; everybody else sees parameters and functions of arrays.
+
+Features lie on the leading axis and the batch on the last, here as in `losses`: kernels are small, batches long, and on a CPU the products and
+the gradients of kernels and biases are fastest along contiguous batches.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+from flax import struct
+
+from hindrl_jax.base.types import Array
+from hindrl_jax.config import AgentConfig
+
+LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
+_KERNEL_INIT = nn.initializers.variance_scaling(1.0 / 3.0, "fan_in", "uniform")  # U(-b, b), b = 1 / sqrt(fan_in), as in the thesis's framework
+
+Params = Any
+
+
+@jax.custom_vjp
+def _bfloat16_product(kernel: Array, features: Array) -> Array:
+    """kernel^T features, (in, out) and (in, B) -> (out, B), from operands rounded to bfloat16, summed in float32, in both directions."""
+    return _bfloat16_forward(kernel, features)[0]
+
+
+def _dot(a: Array, b: Array, *, contract: tuple[int, int]) -> Array:
+    return jax.lax.dot_general(a, b, (((contract[0],), (contract[1],)), ((), ())), preferred_element_type=jnp.float32)
+
+
+def _bfloat16_forward(kernel: Array, features: Array) -> tuple[Array, tuple[Array, Array]]:
+    kernel, features = kernel.astype(jnp.bfloat16), features.astype(jnp.bfloat16)
+    # The barrier keeps the transposition out of the product, whose fast form on a CPU takes row-major operands.
+    return _dot(jax.lax.optimization_barrier(kernel.T), features, contract=(1, 0)), (kernel, features)
+
+
+def _bfloat16_backward(residuals: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
+    kernel, features = residuals
+    cotangent = cotangent.astype(jnp.bfloat16)
+    return _dot(features, cotangent, contract=(1, 1)), _dot(kernel, cotangent, contract=(1, 0))
+
+
+_bfloat16_product.defvjp(_bfloat16_forward, _bfloat16_backward)
+
+
+class Dense(nn.Module):
+    """Affine layer along the leading axis: (in, B) -> (width, B)."""
+
+    width: int
+    bfloat16: bool
+
+    @nn.compact
+    def __call__(self, features: Array) -> Array:
+        kernel = self.param("kernel", _KERNEL_INIT, (features.shape[0], self.width))
+        bias = self.param("bias", nn.initializers.zeros, (self.width,))
+        product = _bfloat16_product(kernel, features) if self.bfloat16 else kernel.T @ features
+        return product + bias[:, None]
+
+
+class MLP(nn.Module):
+    """Fully connected ReLU network: (in, B) -> (out_dim, B)."""
+
+    net_arch: tuple[int, ...]
+    out_dim: int
+    layer_norm: bool = False
+    bfloat16: bool = False
+
+    @nn.compact
+    def __call__(self, features: Array) -> Array:
+        for width in self.net_arch:
+            features = Dense(width, self.bfloat16)(features)
+            if self.layer_norm:
+                features = nn.LayerNorm(reduction_axes=0, feature_axes=0)(features)
+            features = nn.relu(features)
+        return Dense(self.out_dim, self.bfloat16)(features)
+
+
+class ActionDistribution(struct.PyTreeNode, kw_only=True):
+    """A Gaussian squashed by tanh, one per batch column."""
+
+    mean: Array  # (A, B), before tanh
+    log_std: Array  # (A, B)
+
+    @property
+    def mode(self) -> Array:
+        """The deterministic action tanh(mean): (A, B)."""
+        return jnp.tanh(self.mean)
+
+    def sample(self, key: Array) -> tuple[Array, Array]:
+        """A reparameterised action (A, B) in (-1, 1) and its log-probability (B,)."""
+        return self.at(jax.random.normal(key, self.mean.shape))
+
+    def at(self, noise: Array) -> tuple[Array, Array]:
+        """The action (A, B) that standard normal noise (A, B) leads to, and its log-probability (B,)."""
+        pre_tanh = self.mean + jnp.exp(self.log_std) * noise
+        log_prob = -0.5 * jnp.square(noise) - self.log_std - 0.5 * jnp.log(2.0 * jnp.pi)
+        # log(1 - tanh(x)^2), in the form that does not cancel for large |x|
+        log_slope = 2.0 * (jnp.log(2.0) - pre_tanh - jax.nn.softplus(-2.0 * pre_tanh))
+        return jnp.tanh(pre_tanh), jnp.sum(log_prob - log_slope, axis=0)
+
+
+def _actor(config: AgentConfig, action_dim: int) -> MLP:
+    return MLP(net_arch=config.net_arch, out_dim=2 * action_dim, bfloat16=config.network_precision == "bfloat16")
+
+
+def _critic(config: AgentConfig, out_dim: int) -> MLP:
+    return MLP(net_arch=config.net_arch, out_dim=out_dim, layer_norm=config.layer_norm, bfloat16=config.network_precision == "bfloat16")
+
+
+def init_actor(key: Array, config: AgentConfig, *, input_dim: int, action_dim: int) -> Params:
+    """Parameters of the actor for inputs (input_dim, B)."""
+    return _actor(config, action_dim).init(key, jnp.zeros((input_dim, 1)))
+
+
+def init_critics(key: Array, config: AgentConfig, *, input_dim: int, action_dim: int) -> Params:
+    """Parameters of the N critics, stacked along the leading axis of every leaf."""
+    keys = jax.random.split(key, config.num_critics)
+    return jax.vmap(lambda key: _critic(config, config.critic_outputs).init(key, jnp.zeros((input_dim + action_dim, 1))))(keys)
+
+
+def apply_actor(params: Params, inputs: Array, config: AgentConfig, *, action_dim: int) -> ActionDistribution:
+    """The policy at inputs (input_dim, B); the logarithm of the deviation is clamped to [-20, 2]."""
+    output: Any = _actor(config, action_dim).apply(params, inputs)
+    mean, log_std = jnp.split(output, 2, axis=0)
+    return ActionDistribution(mean=mean, log_std=jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX))
+
+
+def _apply_each(params: Params, inputs: Array, action: Array, config: AgentConfig, out_dim: int) -> Array:
+    # One critic after the other: as one batched product they are slower on a CPU.
+    joint = jnp.concatenate([inputs, action], axis=0)
+    critic: Any = _critic(config, out_dim)
+    num_critics = jax.tree.leaves(params)[0].shape[0]
+    members = [jax.tree.map(lambda leaf, n=n: leaf[n], params) for n in range(num_critics)]
+    return jnp.stack([critic.apply(member, joint) for member in members])
+
+
+def apply_critics(params: Params, inputs: Array, action: Array, config: AgentConfig) -> Array:
+    """Quantiles of the return at inputs (input_dim, B) and actions (A, B): (N, Q, B); for algorithms without quantiles Q is 1.
+
+    N is that of the parameters, which may be a subset of the critics.
+    """
+    return _apply_each(params, inputs, action, config, config.critic_outputs)
+
+
+def mean_return(params: Params, inputs: Array, action: Array, config: AgentConfig) -> Array:
+    """Mean over critics and quantiles of `apply_critics`, (B,), in less work: the last layer is linear, so its kernel is averaged instead."""
+    last = f"Dense_{len(config.net_arch)}"
+    output = jax.tree.map(lambda leaf: jnp.mean(leaf, axis=-1, keepdims=True), params["params"][last])
+    averaged = {"params": {**params["params"], last: output}}
+    return jnp.mean(_apply_each(averaged, inputs, action, config, 1), axis=(0, 1))

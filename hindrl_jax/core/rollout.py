@@ -1,0 +1,145 @@
+"""Stepping many environments side by side, for experience and for evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from hindrl_jax.base.environments import Environment, RestorableEnvironment, action_to_env
+from hindrl_jax.base.types import Array, TimeStep, tree_where
+from hindrl_jax.core.goals import GoalTable, sample_goals
+from hindrl_jax.core.randomness import uniform_in_groups
+
+Act = Callable[[Array, Array, Array], Array]
+"""(key, observations (E, D), desired goals (E, G)) -> actions (E, A) in [-1, 1]."""
+
+
+class RolloutState(struct.PyTreeNode, kw_only=True):
+    """E environments in the middle of their episodes."""
+
+    env_state: Any  # leaves (E, ...)
+    observation: Array  # (E, D)
+    desired_goal: Array  # (E, G), the behavioural goals
+    judged_by_goal: Array  # (E,) bool, whether the episode is to be rewarded for reaching that goal rather than by the environment
+
+
+class StartTable(struct.PyTreeNode, kw_only=True):
+    """Demonstrated states in which an episode may begin: all but the last of each demonstration, where nothing is left to do."""
+
+    states: Array  # (N, T + 1, S) as vectors, see `RestorableEnvironment`; padded
+    lengths: Array  # (N,) int32, number of transitions
+
+
+def sample_starts(key: Array, table: StartTable, num_starts: int, *, share: Array | float = 1.0) -> Array:
+    """Draws states uniformly from the last `share` of each demonstration, of which at least one state is left.
+
+    Args:
+      key: random key.
+      table: N demonstrations.
+      num_starts: how many to draw.
+      share: () in [0, 1].
+
+    Returns:
+      (num_starts, S).
+    """
+    eligible = jnp.clip(jnp.ceil(share * table.lengths).astype(jnp.int32), 1, table.lengths)
+    demo, steps_left = uniform_in_groups(key, num_starts, eligible)
+    return table.states[demo, table.lengths[demo] - steps_left]
+
+
+def reset(
+    key: Array,
+    env: Environment,
+    behavioural_goals: GoalTable,
+    num_envs: int,
+    *,
+    starts: StartTable | None = None,
+    demo_reset_ratio: float = 0.0,
+    demo_reset_share: Array | float = 1.0,
+) -> RolloutState:
+    """Starts `num_envs` episodes, each with a goal drawn from the table (thesis algorithm 5).
+
+    Args:
+      key: random key.
+      env: static; a `RestorableEnvironment` if there are `starts`.
+      behavioural_goals: the table.
+      num_envs: E.
+      starts: with probability `demo_reset_ratio` an episode begins in one of these states instead of the environment's own.
+      demo_reset_ratio: that probability.
+      demo_reset_share: the share of each demonstration, up to its end, that they are drawn from.
+    """
+    key_env, key_goal = jax.random.split(key)
+    env_state, observation = jax.vmap(env.reset)(jax.random.split(key_env, num_envs))
+    if starts is not None:
+        restorable = cast(RestorableEnvironment, env)
+        key_choice, key_start, key_states = jax.random.split(jax.random.fold_in(key, 2), 3)  # 2: split has used what 0 and 1 give
+        vectors = sample_starts(key_start, starts, num_envs, share=demo_reset_share)
+        demonstrated = jax.vmap(restorable.vector_to_state)(jax.random.split(key_states, num_envs), vectors)
+        chosen = jax.random.bernoulli(key_choice, demo_reset_ratio, (num_envs,))
+        env_state = tree_where(chosen, demonstrated, env_state)
+        observation = jax.vmap(restorable.observe)(env_state)
+    return RolloutState(
+        env_state=env_state,
+        observation=observation,
+        desired_goal=sample_goals(key_goal, behavioural_goals, num_envs),
+        judged_by_goal=jnp.zeros(num_envs, bool),
+    )
+
+
+def step(
+    rollout: RolloutState, restarted: RolloutState, action: Array, env: Environment, *, cut: Array | None = None
+) -> tuple[RolloutState, TimeStep]:
+    """Steps every environment, and goes on from a new episode where one has ended.
+
+    Args:
+      rollout: E environments.
+      restarted: E new episodes from `reset`; those that are not needed are dropped.
+      action: (E, A) in [-1, 1].
+      env: static.
+      cut: (E,) bool, episodes to be truncated after this step, unless it ends them.
+
+    Returns:
+      The new state, and the time steps (E, ...) before the resets: their observation is the true next one.
+    """
+    env_state, time_step = jax.vmap(env.step)(rollout.env_state, action_to_env(action, env))
+    if cut is not None:
+        time_step = time_step.replace(truncated=time_step.truncated | (cut & ~time_step.terminated))
+    continued = rollout.replace(env_state=env_state, observation=time_step.observation)
+    return tree_where(time_step.terminated | time_step.truncated, restarted, continued), time_step
+
+
+class Evaluation(struct.PyTreeNode, kw_only=True):
+    """What became of a number of fresh episodes."""
+
+    success: Array  # (episodes,) bool
+    length: Array  # (episodes,) int32, steps taken
+
+
+def evaluate(key: Array, env: Environment, behavioural_goals: GoalTable, act: Act, num_episodes: int) -> Evaluation:
+    """Plays fresh episodes to their end; an episode is a success if any of its rewards is positive.
+
+    Args:
+      key: random key.
+      env: static.
+      behavioural_goals: each episode draws its goal from here.
+      act: the policy; it is given keys, and may ignore them.
+      num_episodes: played side by side.
+    """
+    key_reset, key_play = jax.random.split(key)
+    start = reset(key_reset, env, behavioural_goals, num_episodes)
+    result = Evaluation(success=jnp.zeros(num_episodes, bool), length=jnp.zeros(num_episodes, jnp.int32))
+
+    def one_step(carry: tuple[Array, Any, Array, Array, Evaluation], _: None) -> tuple[tuple[Array, Any, Array, Array, Evaluation], None]:
+        key, env_state, observation, over, result = carry
+        key, key_act = jax.random.split(key)
+        action = act(key_act, observation, start.desired_goal)
+        env_state, time_step = jax.vmap(env.step)(env_state, action_to_env(action, env))
+        result = Evaluation(success=result.success | (~over & (time_step.reward > 0.0)), length=result.length + ~over)
+        return (key, env_state, time_step.observation, over | time_step.terminated | time_step.truncated, result), None
+
+    carry = (key_play, start.env_state, start.observation, jnp.zeros(num_episodes, bool), result)
+    return jax.lax.scan(one_step, carry, length=env.horizon)[0][-1]

@@ -1,0 +1,144 @@
+"""How a training goes, for a person: a bar that moves and about ten lines that stay. Says the same in a terminal, a notebook and a log file."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.text import Text
+
+from hindrl_jax.training.experiment import Result, Row
+
+_WIDTHS = (10, 30)  # the least and the most characters of the bar
+
+
+class ProgressBar:
+    """A `report` of `fit`: `hindrl.fit(env, demonstrations, config, report=hindrl.ProgressBar())`.
+
+    A line stays for the evaluation at each tenth of the run; below them a bar moves, in a terminal or a notebook. A log file gets the lines alone,
+    without control characters. Nothing runs beside the training, so nothing is left behind when it is interrupted.
+    """
+
+    def __init__(self, *, lines: int = 10, console: Console | None = None):
+        """Shows nothing yet.
+
+        Args:
+          lines: of how many evaluations a line stays, at most.
+          console: where to write; standard output by default.
+        """
+        self._lines = lines
+        self._console = console or Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
+        self._live = self._console.is_terminal and not self._console.is_dumb_terminal and not self._console.legacy_windows
+        self._drawn = False  # whether the cursor stands behind a bar
+        self._handle: Any = None  # the bar of a notebook
+        self._began: tuple[int, float] | None = None  # steps done and seconds when learning began
+        self._rows_seen: int | None = None
+        self._lines_said = 0
+
+    def __call__(self, result: Result) -> None:
+        """Brings everything up to date."""
+        tenths = math.floor(self._lines * result.steps_done / result.config.steps)
+        if self._rows_seen is None or len(result.rows) < self._rows_seen:  # a training begins, or goes on after an interruption
+            self._began, self._rows_seen, self._lines_said = None, len(result.rows), tenths
+        if len(result.rows) > self._rows_seen:
+            self._rows_seen = len(result.rows)
+            if tenths > self._lines_said:
+                self._lines_said = tenths
+                self.say(evaluation_line(result.rows[-len(result.seeds) :]))
+        if result.final_success is None:
+            if self._began is None and result.train_seconds:
+                self._began = (result.steps_done, result.train_seconds)
+            self._draw(bar(result, self._began, width=self._console.width - 1, unicode="utf" in self._console.encoding.lower()))
+        else:
+            self.close()
+
+    def wait(self, what: str) -> None:
+        """Shows what is being waited for in place of the bar; not in a log file."""
+        self._draw(Text(what))
+
+    def say(self, line: str) -> None:
+        """Writes a line that stays, above the bar."""
+        self._wipe()
+        if self._console.is_jupyter:
+            print(line)
+        else:
+            self._console.print(line)
+
+    def close(self) -> None:
+        """Takes the bar away; the lines stay."""
+        self._wipe()
+        if self._handle is not None:
+            from IPython.display import HTML
+
+            self._handle.update(HTML(""))
+            self._handle = None
+
+    def __enter__(self) -> ProgressBar:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _draw(self, text: Text) -> None:
+        if self._console.is_jupyter:
+            self._draw_in_notebook(text.plain)
+        elif self._live:
+            self._wipe()
+            text.truncate(self._console.width - 1, overflow="ellipsis")
+            self._console.print(text, end="")
+            self._drawn = True
+
+    def _draw_in_notebook(self, text: str) -> None:
+        from IPython.display import HTML, display
+
+        picture = HTML(f"<pre style='margin: 0'>{html.escape(text)}</pre>")
+        if self._handle is None:
+            self._handle = display(picture, display_id=True)
+        else:
+            self._handle.update(picture)
+
+    def _wipe(self) -> None:
+        if self._drawn:
+            self._console.file.write("\r\x1b[2K")
+            self._console.file.flush()
+            self._drawn = False
+
+
+def bar(result: Result, began: tuple[int, float] | None, *, width: int, unicode: bool = True) -> Text:
+    """One line on a training under way: a bar, the steps done, the newest success, steps per second over all seeds, and the time that is left.
+
+    Args:
+      result: the training.
+      began: steps done and seconds of training when learning began: the random steps before that take hardly any time.
+      width: characters that there is room for.
+      unicode: draw with more than ASCII.
+    """
+    done, total = min(result.steps_done, result.config.steps), result.config.steps
+    unit = "updates" if result.config.algo == "bc" else "steps"
+    words = f" {done:,}/{total:,} {unit}"
+    success = result.latest_success()
+    if success is not None:
+        words += f", success {success:.0%}"
+    if began is not None and result.steps_done > began[0] and result.train_seconds > began[1]:
+        speed = (result.steps_done - began[0]) / (result.train_seconds - began[1])
+        left = round((total - done) / speed)
+        words += f", {len(result.seeds) * speed:,.0f} {unit}/s, {left // 60}:{left % 60:02d} left"
+    length = min(max(width - len(words), _WIDTHS[0]), _WIDTHS[1])
+    full = round(length * done / total)
+    glyph, rest = "━─" if unicode else "#."
+    return Text.assemble((glyph * full, "cyan"), (rest * (length - full), "bright_black"), words)
+
+
+def evaluation_line(rows: Sequence[Row]) -> str:
+    """One line on one evaluation, from the rows of all seeds."""
+    success = [row.success for row in rows]
+    spread = f" (worst {min(success):4.0%})" if len(rows) > 1 else ""
+    steps = f"{rows[0].env_steps:9,d} steps " if rows[0].env_steps else ""  # bc takes none
+    return (
+        f"{steps}{rows[0].updates:8,d} updates {rows[0].seconds:7.1f} s   "
+        f"success {np.mean(success):4.0%}{spread}   length {np.mean([row.episode_length for row in rows]):5.1f}"
+    )

@@ -1,0 +1,126 @@
+"""A run's directory and what its run was asked to do.
+
+    config.json       everything needed to run it again (`hindrl train --config`)
+    metrics.csv       a row per evaluation and seed, written as the run goes
+    summary.json      the outcome per seed and the totals
+    parameters.npz    networks and behavioural goals, leading axis the seeds; no pickle
+    curve.png, episode.gif
+    checkpoint/       while it is under way, or if it was stopped: what it needs to go on
+
+Each file is written whole or not at all, metrics.csv row by row.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args, get_type_hints
+
+from hindrl_jax.base.environments import RestorableEnvironment
+from hindrl_jax.base.errors import UserError, one_line
+from hindrl_jax.config import TrainConfig
+from hindrl_jax.tasks.registry import did_you_mean, full_name, make
+from hindrl_jax.training.experiment import Row
+
+if TYPE_CHECKING:
+    pass
+
+CONFIG, METRICS, SUMMARY, PARAMETERS = "config.json", "metrics.csv", "summary.json", "parameters.npz"
+CURVE, EPISODE = "curve.png", "episode.gif"
+CHECKPOINTS, LOCK = "checkpoint", ".lock"
+SWEEP_SETTINGS, SWEEP, SWEEP_CURVES = "sweep.json", "sweep.csv", "sweep.png"
+FROM_PYTHON = "given from Python"
+RUN_FILES = (CONFIG, METRICS, SUMMARY, PARAMETERS, CURVE, EPISODE)
+ROW_FIELDS = [field.name for field in dataclasses.fields(Row) if field.name != "metrics"]
+
+
+@dataclasses.dataclass(frozen=True)
+class RunSpec:
+    """Everything that a run was asked to do."""
+
+    env: RestorableEnvironment
+    config: TrainConfig
+    demos: str
+    """A number of demonstrations to record for each seed, or the path of a file."""
+    seeds: tuple[int, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data for `config.json`."""
+        return {
+            "env": full_name(self.env),
+            "env_args": dataclasses.asdict(self.env),
+            "demos": self.demos,
+            "seeds": list(self.seeds),
+            "config": dataclasses.asdict(self.config),
+        }
+
+    @staticmethod
+    def from_json(data: Any, where: Path) -> RunSpec:
+        """The inverse of `to_json`.
+
+        Raises:
+          UserError: naming the file and the first field that is missing, unknown or unusable.
+        """
+        known = ("env", "env_args", "demos", "seeds", "config")
+        if not isinstance(data, dict):
+            raise UserError(f"{where} does not hold a run's configuration: use a config.json that `hindrl train` wrote")
+        _refuse_unknown(data, known, where)
+        for name in known:
+            if name not in data:
+                raise UserError(f"{where} lacks {name!r}: use a config.json that `hindrl train` wrote")
+        seeds, env_args = data["seeds"], data["env_args"]
+        if not isinstance(env_args, dict):
+            raise UserError(f"{where}: env_args = {env_args!r} is not usable: it must be an object of the environment's arguments")
+        if not (isinstance(seeds, list) and seeds and all(type(seed) is int and 0 <= seed < 2**32 for seed in seeds)):
+            raise UserError(f"{where}: seeds = {seeds!r} is not usable: it must be a list of whole numbers from 0 to {2**32 - 1}")
+        return RunSpec(
+            env=make(str(data["env"]), **env_args),
+            config=_config_from_dict(TrainConfig, data["config"], where),
+            demos=str(data["demos"]),
+            seeds=tuple(seeds),
+        )
+
+
+def read_spec(path: Path) -> RunSpec:
+    """Reads a run's `config.json`; `path` is the file or the run's directory.
+
+    Raises:
+      UserError: if it is not there or not usable.
+    """
+    path = path / CONFIG if path.is_dir() else path
+    try:
+        data = json.loads(path.read_text())
+    except FileNotFoundError:
+        raise UserError(f"{path} does not exist: give the directory of a run, or its {CONFIG}") from None
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise UserError(f"{path} cannot be read as JSON ({one_line(error)}): use a {CONFIG} that `hindrl train` wrote") from error
+    return RunSpec.from_json(data, path)
+
+
+def _config_from_dict(config_class: type[Any], data: Any, where: Path) -> Any:
+    if not isinstance(data, dict):
+        raise UserError(f"{where}: {config_class.__name__} is {data!r}, not an object of fields")
+    hints = get_type_hints(config_class)
+    _refuse_unknown(data, hints, where)
+    values = {}
+    for name, value in data.items():
+        if dataclasses.is_dataclass(hints[name]):
+            values[name] = _config_from_dict(hints[name], value, where)
+        else:
+            values[name] = _tuples(value) if get_args(hints[name]) else value
+    try:
+        return config_class(**values)
+    except ValueError as error:
+        raise UserError(f"{where}: {error}") from error
+
+
+def _tuples(value: Any) -> Any:
+    """JSON's lists, also those within lists, as the tuples that they were."""
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
+def _refuse_unknown(data: dict[str, Any], known: Any, where: Path) -> None:
+    for name in data:
+        if name not in known:
+            raise UserError(f"{where} has an unknown field {name!r}{did_you_mean(name, known)}; it may have {', '.join(known)}")

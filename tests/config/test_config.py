@@ -1,0 +1,246 @@
+"""Configs: every field does something, equal configs are one, and bad values are named."""
+
+import ast
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+import hindrl_jax
+from hindrl_jax import config
+from hindrl_jax.config import AgentConfig, BatchConfig, GoalConfig, TrainConfig
+
+SOURCES = [path for path in Path(hindrl_jax.__file__).parent.rglob("*.py") if path.parent.name != "config"]
+FIELDS = [(part, field.name) for part in (BatchConfig, GoalConfig, AgentConfig, TrainConfig) for field in dataclasses.fields(part)]
+# Derived in config.py itself and read elsewhere under another name.
+READ_THROUGH = {
+    "max_demo_ratio": "max_demo_rows",
+    "hindrl_sampling_strategy": "sources",
+    "union_sampling_ratio": "sources",
+    "strategy_mixture": "sources",
+    "num_quantiles": "critic_outputs",
+    "final_achieved_goal_ratio": "has_achieved_goals",
+}
+
+
+@pytest.fixture(scope="module")
+def attributes_read():
+    """Names of all attributes read (not written) in the package, and keyword arguments left out: replace(m=1) does not read m."""
+    trees = [ast.parse(path.read_text()) for path in SOURCES]
+    return {node.attr for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load)}
+
+
+@pytest.mark.parametrize(("config", "name"), FIELDS, ids=lambda value: getattr(value, "__name__", value))
+def test_every_field_is_read_somewhere(config, name, attributes_read):
+    assert name in attributes_read or READ_THROUGH.get(name) in attributes_read
+
+
+@pytest.mark.parametrize(("config", "name"), FIELDS, ids=lambda value: getattr(value, "__name__", value))
+def test_every_field_has_a_line_of_documentation(config, name):
+    tree = ast.parse((Path(hindrl_jax.__file__).parent / "config" / "__init__.py").read_text())
+    body = next(node.body for node in tree.body if isinstance(node, ast.ClassDef) and node.name == config.__name__)
+    index = next(i for i, node in enumerate(body) if isinstance(node, ast.AnnAssign) and node.target.id == name)
+    if dataclasses.is_dataclass(getattr(config, name)):
+        return  # a nested config, documented by its own fields
+    following = body[index + 1]
+    assert isinstance(following, ast.Expr)
+    assert isinstance(following.value.value, str)
+
+
+def test_equal_configs_are_equal_and_hash_equal():
+    def build():
+        return TrainConfig(batch=BatchConfig(gamma=0.9), agent=AgentConfig(net_arch=tuple([8, 8])), goal=GoalConfig(m=2, k=1.0))
+
+    assert build() == build()
+    assert build() is not build()
+    assert hash(build()) == hash(build())
+    assert build() != dataclasses.replace(build(), batch=BatchConfig(gamma=0.8))
+
+
+def test_configs_are_frozen():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        TrainConfig().steps = 3
+
+
+BAD = [
+    (BatchConfig, "batch_size", [0, 1.5, True, "512"]),
+    (BatchConfig, "max_demo_ratio", [-0.1, 1.1, float("nan"), None, 1.0]),  # 1.0 leaves no replay row
+    (BatchConfig, "reach_zero", [0, -5, 0.5]),
+    (BatchConfig, "num_sampled_goals", [-1, "4", float("inf")]),
+    (BatchConfig, "hindrl_sampling_strategy", ["intersection", "Future", None, "mixture"]),
+    (BatchConfig, "union_sampling_ratio", [-0.1, 1.5]),
+    (BatchConfig, "intersection_goals", ["both"]),
+    (BatchConfig, "strategy_mixture", [(("future", 0.0),), (("joint_union", 1.0),), (("future", 1.0, 2.0),), (("future", 1.0),), "future"]),
+    (BatchConfig, "demo_returns", ["mc"]),
+    (BatchConfig, "n_step", [0, None]),
+    (BatchConfig, "gamma", [0.0, 1.01, float("inf")]),
+    (BatchConfig, "inclusive_goal_test", [1, "yes"]),
+    (BatchConfig, "terminate_on_relabel", [0]),
+    (BatchConfig, "bound_by_obtained_return", [1, "yes"]),
+    (BatchConfig, "timeouts_are_terminal", [None]),
+    (BatchConfig, "priority_exponent", [-0.1, 1.1, float("nan"), None]),
+    (BatchConfig, "importance_exponent", [-0.1, 1.1, None]),
+    (BatchConfig, "demo_priority_bonus", [-0.1, float("inf"), "1", 0.5]),  # 0.5 while transitions are drawn uniformly
+    (GoalConfig, "m", [-1, 0.5]),
+    (GoalConfig, "k", [-0.1, float("nan")]),
+    (GoalConfig, "epsilon", [-0.1, float("nan"), "0.1"]),
+    (GoalConfig, "epsilon_filtering", [1]),
+    (GoalConfig, "behavioural_goals", ["final"]),
+    (GoalConfig, "achieved_goal_ratio", [-0.1, 1.1, None]),
+    (GoalConfig, "final_achieved_goal_ratio", [-0.1, 1.1, "0"]),
+    (GoalConfig, "exclude_last_goal", [0]),
+    (GoalConfig, "rescale_demo_actions", ["true"]),
+    (GoalConfig, "misalign_demo_actions", [1.0]),
+    (AgentConfig, "net_arch", [(), (8, 0), [8, 8], (8.0,), 8]),
+    (AgentConfig, "layer_norm", [1]),
+    (AgentConfig, "network_precision", ["float16", 32]),
+    (AgentConfig, "learning_rate", [0.0, -1e-3, float("inf"), "1e-3"]),
+    (AgentConfig, "clip_targets", [1.0]),
+    (AgentConfig, "base", ["ppo", None]),
+    (AgentConfig, "num_critics", [0]),
+    (AgentConfig, "num_target_critics", [0, 3]),
+    (AgentConfig, "actor_delay", [0]),
+    (AgentConfig, "max_gradient_norm", [0.0, "1"]),
+    (AgentConfig, "exploration_noise", [-0.1]),
+    (AgentConfig, "target_noise", [-0.1]),
+    (AgentConfig, "target_noise_clip", [-0.1]),
+    (AgentConfig, "normalise_value", [1]),
+    (AgentConfig, "relative_value", [1]),
+    (AgentConfig, "preactivation_weight", [-0.1, None]),
+    (AgentConfig, "final_bc_weight", [-1.0, float("nan")]),
+    (AgentConfig, "q_filter", ["yes"]),
+    (AgentConfig, "num_quantiles", [0]),
+    (AgentConfig, "top_quantiles_to_drop_per_net", [-1, AgentConfig().num_quantiles]),
+    (AgentConfig, "target_update_rate", [0.0, 1.1]),
+    (AgentConfig, "actor_average_rate", [0.0, 1.1]),
+    (AgentConfig, "actor_average_span", [-0.1]),
+    (AgentConfig, "initial_alpha", [0.0]),
+    (AgentConfig, "final_learning_rate", [float("nan"), -1.0]),
+    (AgentConfig, "target_entropy", [float("nan"), "auto"]),
+    (AgentConfig, "final_target_entropy", [float("nan")]),
+    (AgentConfig, "bc_weight", [-1.0]),
+    (AgentConfig, "bc_loss", ["l2"]),
+    (AgentConfig, "bc_action", ["mode"]),
+    (AgentConfig, "input_encoding", ["scaled", "standardized"]),
+    (AgentConfig, "policy_input", ["observation"]),
+    (TrainConfig, "algo", ["HinDRL", "sac"]),
+    (TrainConfig, "steps", [0, 1e5]),
+    (TrainConfig, "num_envs", [0]),
+    (TrainConfig, "updates_per_iteration", [0]),
+    (TrainConfig, "learning_starts", [-1]),
+    (TrainConfig, "demo_reset_ratio", [-0.1, 1.1, None]),
+    (TrainConfig, "random_truncation", [-0.1, 1.0, None]),
+    (TrainConfig, "agent_resets", [(0.0,), (1.0,), (0.5, 0.5), (0.6, 0.3), (0.5, "1"), 0.5, None]),
+    (TrainConfig, "demo_reset_curriculum", [-0.1, 1.1, 0.5]),  # 0.5 without resets to demonstrated states
+    (TrainConfig, "bc_warm_start", [-1, 0.5]),
+    (TrainConfig, "pretrain_updates", [-1, 0.5]),
+    (TrainConfig, "buffer_size", [0, 1e6]),
+    (TrainConfig, "eval_every", [0]),
+    (TrainConfig, "eval_episodes", [0]),
+    (TrainConfig, "batch", [None, {}, AgentConfig()]),
+    (TrainConfig, "goal", [None]),
+    (TrainConfig, "agent", [None]),
+]
+
+
+@pytest.mark.parametrize(("config", "name", "value"), [(config, name, value) for config, name, values in BAD for value in values])
+def test_bad_values_are_named(config, name, value):
+    with pytest.raises(ValueError, match=rf"\b{name} = "):
+        config(**{name: value})
+
+
+def test_the_share_of_demonstrations_follows_from_priorities_or_from_the_steps():
+    with pytest.raises(ValueError, match=r"reach_zero = 10 is of no use with priority_exponent = 0\.6.*set one of them to None or 0"):
+        BatchConfig(reach_zero=10, priority_exponent=0.6)
+
+
+def test_epsilon_is_given_or_found_but_not_both():
+    GoalConfig(epsilon=0.1)
+    with pytest.raises(ValueError, match="m = 5 is of no use"):
+        GoalConfig(epsilon=0.1, m=5)
+
+
+def test_the_table_of_bad_values_is_complete():
+    assert {(config, name) for config, name, _ in BAD} == set(FIELDS)
+
+
+@pytest.mark.parametrize(
+    "build",
+    [
+        lambda: BatchConfig(max_demo_ratio=0, gamma=1, reach_zero=None, num_sampled_goals=0.5),  # an int serves as a float
+        lambda: AgentConfig(num_quantiles=25, top_quantiles_to_drop_per_net=24, target_entropy=-3.0, bc_weight=0, net_arch=(1,)),
+        lambda: TrainConfig(algo="bc", steps=1, learning_starts=5),  # cloning takes no environment steps
+        lambda: TrainConfig(demo_reset_ratio=1),
+        lambda: BatchConfig(priority_exponent=1, importance_exponent=0, demo_priority_bonus=100),
+    ],
+)
+def test_values_at_the_edge_are_accepted(build):
+    assert build() == build()
+
+
+@pytest.mark.parametrize(
+    ("fitting", "contradiction", "name"),
+    [
+        (dict(algo="tqcfd", batch=BatchConfig(num_sampled_goals=0)), dict(batch=BatchConfig(num_sampled_goals=1)), "num_sampled_goals"),
+        (dict(algo="smooth-hindrl", goal=GoalConfig(epsilon_filtering=True)), dict(goal=GoalConfig()), "epsilon_filtering"),
+    ],
+)
+def test_the_algorithm_must_fit_its_settings(fitting, contradiction, name):
+    config = TrainConfig(**fitting)
+    with pytest.raises(ValueError, match=name):
+        dataclasses.replace(config, **contradiction)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        dict(bc_warm_start=1),
+        dict(pretrain_updates=1),
+        dict(agent=AgentConfig(q_filter=True)),
+        dict(agent=AgentConfig(base="sac")),
+        dict(batch=BatchConfig(priority_exponent=0.5)),
+    ],
+)
+def test_cloning_alone_refuses_what_it_would_ignore(changes):
+    with pytest.raises(ValueError, match="has no effect on bc"):
+        TrainConfig(algo="bc", **changes)
+
+
+def test_rollout_conditioned_is_the_name_of_the_thesis_for_future():
+    assert BatchConfig(hindrl_sampling_strategy="rollout_conditioned") == BatchConfig(hindrl_sampling_strategy="future")
+    assert BatchConfig(hindrl_sampling_strategy="rollout_conditioned").hindrl_sampling_strategy == "future"
+
+
+@pytest.mark.parametrize(("size", "ratio", "rows"), [(4096, 0.1, 409), (12_000, 0.1, 1200), (10, 0.0, 0), (3, 0.3, 0), (3, 0.34, 1)])
+def test_number_of_demonstration_rows(size, ratio, rows):
+    assert BatchConfig(batch_size=size, max_demo_ratio=ratio).max_demo_rows == rows
+
+
+def test_conditions_are_about_fields_that_exist():
+    known = {field.name for part in (TrainConfig, BatchConfig, GoalConfig, AgentConfig) for field in dataclasses.fields(part)}
+    assert {name for names, _, _ in config._CONDITIONS for name in names.split()} <= known
+
+
+@pytest.mark.parametrize(
+    ("changes", "name", "reason"),
+    [
+        ({}, "num_quantiles", None),
+        ({"agent": {"base": "sac"}}, "num_quantiles", "sac has no quantiles"),
+        ({"agent": {"base": "td3"}}, "target_entropy", "td3 has no entropy coefficient"),
+        ({}, "exploration_noise", "tqc samples its actions"),
+        ({"agent": {"base": "td3"}}, "exploration_noise", None),
+        ({}, "union_sampling_ratio", "only relabelling by joint_union"),
+        ({"batch": {"hindrl_sampling_strategy": "joint_union"}}, "union_sampling_ratio", None),
+        ({"batch": {"num_sampled_goals": 0.0}}, "hindrl_sampling_strategy", "nothing is relabelled"),
+        ({"batch": {"max_demo_ratio": 0.0}}, "bc_loss", "no demonstration rows to clone"),
+        ({"batch": {"max_demo_ratio": 0.0, "priority_exponent": 0.5}}, "bc_loss", None),
+        ({"agent": {"bc_weight": 0.0}}, "bc_action", "nothing is cloned"),
+        ({}, "learning_rate", None),
+        ({"algo": "bc"}, "learning_rate", None),
+        ({"algo": "bc"}, "num_critics", "behaviour cloning does not use it"),
+    ],
+)
+def test_fields_without_effect_are_known(changes, name, reason):
+    parts = {part: dataclasses.replace(getattr(TrainConfig(), part), **values) for part, values in changes.items() if part != "algo"}
+    said = config.without_effect(TrainConfig(**parts, **{key: value for key, value in changes.items() if key == "algo"}), name)
+    assert said is None if reason is None else reason in said

@@ -1,0 +1,168 @@
+"""Networks: shapes, the density of the squashed Gaussian, and an ensemble whose members differ."""
+
+import dataclasses
+import math
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import linen as nn
+
+from hindrl_jax.config import AgentConfig
+from hindrl_jax.core.networks import LOG_STD_MAX, LOG_STD_MIN, ActionDistribution, apply_actor, apply_critics, init_actor, init_critics, mean_return
+
+CONFIG = AgentConfig(net_arch=(16, 12), num_critics=3, num_quantiles=5, layer_norm=True)
+B, INPUT_DIM, ACTION_DIM = 4, 3, 2
+
+
+def jitted(init):
+    return jax.jit(lambda key: init(key, CONFIG, input_dim=INPUT_DIM, action_dim=ACTION_DIM))
+
+
+@pytest.fixture(scope="module")
+def actor():
+    return jitted(init_actor)(jax.random.key(0))
+
+
+@pytest.fixture(scope="module")
+def critics():
+    return jitted(init_critics)(jax.random.key(1))
+
+
+INPUTS = jnp.asarray(np.random.default_rng(0).normal(size=(INPUT_DIM, B)), jnp.float32)
+
+
+def test_actor(actor):
+    distribution = apply_actor(actor, INPUTS, CONFIG, action_dim=ACTION_DIM)
+    chex.assert_shape([distribution.mean, distribution.log_std, distribution.mode], (ACTION_DIM, B))
+    np.testing.assert_allclose(distribution.mode, np.tanh(distribution.mean), rtol=1e-5)
+    action, log_prob = distribution.sample(jax.random.key(0))
+    chex.assert_shape(action, (ACTION_DIM, B))
+    chex.assert_shape(log_prob, (B,))
+    assert len(np.unique(np.asarray(distribution.mean))) == B * ACTION_DIM  # every column and dimension has its own output
+
+
+def test_net_arch_and_layer_norm_are_obeyed(actor, critics):
+    assert [layer["kernel"].shape for layer in actor["params"].values()] == [(3, 16), (16, 12), (12, 4)]  # no layer norm in the actor
+    assert critics["params"]["Dense_0"]["kernel"].shape == (3, INPUT_DIM + ACTION_DIM, 16)
+    assert critics["params"]["LayerNorm_1"]["scale"].shape == (3, 12)
+    plain = jax.eval_shape(lambda key: init_critics(key, AgentConfig(net_arch=(8,)), input_dim=3, action_dim=2), jax.random.key(0))
+    assert sorted(plain["params"]) == ["Dense_0", "Dense_1"]
+
+
+def test_log_std_is_clamped(actor):
+    distribution = apply_actor(actor, 1e6 * INPUTS, CONFIG, action_dim=ACTION_DIM)
+    assert set(np.unique(distribution.log_std).tolist()) == {LOG_STD_MIN, LOG_STD_MAX} == {-20.0, 2.0}
+
+
+def test_critics(critics):
+    action = jnp.tanh(INPUTS[:ACTION_DIM])
+    quantiles = apply_critics(critics, INPUTS, action, CONFIG)
+    chex.assert_shape(quantiles, (3, 5, B))
+    for i in range(3):
+        for j in range(i):
+            assert np.abs(quantiles[i] - quantiles[j]).max() > 1e-2  # members start apart
+    # One column at a time gives the same: columns do not mix, and axes are not confused.
+    for column in range(B):
+        alone = apply_critics(critics, INPUTS[:, column : column + 1], action[:, column : column + 1], CONFIG)
+        np.testing.assert_allclose(alone[..., 0], quantiles[..., column], atol=1e-5)
+    # The action matters.
+    assert np.abs(apply_critics(critics, INPUTS, -action, CONFIG) - quantiles).max() > 1e-2
+
+
+def test_networks_are_what_flax_makes_of_the_same_parameters(actor, critics):
+    """The features-first layers against flax.linen's own, row by row."""
+
+    class Reference(nn.Module):
+        out_dim: int
+        layer_norm: bool
+
+        @nn.compact
+        def __call__(self, rows):
+            for width in CONFIG.net_arch:
+                rows = nn.Dense(width)(rows)
+                rows = nn.relu(nn.LayerNorm()(rows) if self.layer_norm else rows)
+            return nn.Dense(self.out_dim)(rows)
+
+    action = jnp.tanh(INPUTS[:ACTION_DIM])
+    distribution = apply_actor(actor, INPUTS, CONFIG, action_dim=ACTION_DIM)
+    expected = Reference(2 * ACTION_DIM, layer_norm=False).apply(actor, INPUTS.T)
+    np.testing.assert_allclose(jnp.concatenate([distribution.mean, distribution.log_std]).T, expected, atol=1e-5)
+    for n in range(CONFIG.num_critics):
+        parameters = jax.tree.map(lambda leaf, n=n: leaf[n], critics)
+        expected = Reference(CONFIG.num_quantiles, layer_norm=True).apply(parameters, jnp.concatenate([INPUTS, action]).T)
+        np.testing.assert_allclose(apply_critics(critics, INPUTS, action, CONFIG)[n].T, expected, atol=1e-5)
+
+
+def test_mean_return_is_the_mean_of_the_quantiles(critics):
+    action = jnp.tanh(INPUTS[:ACTION_DIM])
+
+    def by_definition(critics, action):
+        return jnp.mean(apply_critics(critics, INPUTS, action, CONFIG), axis=(0, 1))
+
+    np.testing.assert_allclose(mean_return(critics, INPUTS, action, CONFIG), by_definition(critics, action), atol=1e-6)
+    given, expected = (
+        jax.grad(lambda *arguments, f=f: jnp.sum(jnp.sin(f(*arguments))), argnums=(0, 1))(critics, action)
+        for f in (lambda critics, action: mean_return(critics, INPUTS, action, CONFIG), by_definition)
+    )
+    chex.assert_trees_all_close(given, expected, atol=1e-5)
+
+
+def test_bfloat16_networks_are_the_same_but_rounded(actor):
+    rounded = dataclasses.replace(CONFIG, network_precision="bfloat16")
+
+    def means(config, actor, inputs):
+        return apply_actor(actor, inputs, config, action_dim=ACTION_DIM).mean
+
+    plain, coarse = means(CONFIG, actor, INPUTS), means(rounded, actor, INPUTS)
+    assert coarse.dtype == jnp.float32
+    np.testing.assert_allclose(coarse, plain, atol=0.02)
+    assert np.abs(coarse - plain).max() > 0.0  # it does round
+    gradients = [
+        jax.grad(lambda actor, inputs, c=config: jnp.sum(jnp.square(means(c, actor, inputs))), argnums=(0, 1))(actor, INPUTS)
+        for config in (CONFIG, rounded)
+    ]
+    largest = max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(gradients[0]))
+    chex.assert_trees_all_close(gradients[1], gradients[0], atol=0.03 * largest)
+
+
+def numeric_log_density(action, mean, std):
+    """Log density at `action` of tanh(mean + std * noise), by the derivative of its distribution function."""
+
+    def cumulative(a):
+        return 0.5 * (1.0 + math.erf((math.atanh(a) - mean) / (std * math.sqrt(2.0))))
+
+    step = 1e-4 * (1.0 - abs(action))
+    return math.log((cumulative(action + step) - cumulative(action - step)) / (2.0 * step))
+
+
+def test_log_prob_is_that_of_the_change_of_variables():
+    mean, log_std = np.array([[0.0, 0.5], [-1.0, 1.0], [0.3, -0.2]]), np.array([[0.0, -1.0], [-0.5, 0.3], [-2.0, -0.7]])
+    distribution = ActionDistribution(mean=jnp.asarray(mean.T, jnp.float32), log_std=jnp.asarray(log_std.T, jnp.float32))
+    action, log_prob = (np.asarray(part, np.float64) for part in distribution.sample(jax.random.key(1)))
+    assert np.abs(action).max() < 0.999  # beyond that, float32 actions are too coarse for this check
+    for row in range(3):
+        expected = sum(numeric_log_density(action[i, row], mean[row, i], math.exp(log_std[row, i])) for i in range(2))
+        assert log_prob[row] == pytest.approx(expected, abs=2e-3)
+
+
+def test_samples_follow_the_distribution():
+    mean, std, num = 0.3, 0.5, 20_000
+    distribution = ActionDistribution(mean=jnp.full((1, num), mean), log_std=jnp.full((1, num), math.log(std)))
+    pre_tanh = np.arctanh(np.asarray(distribution.sample(jax.random.key(0))[0], np.float64))
+    assert pre_tanh.mean() == pytest.approx(mean, abs=5 * std / num**0.5)
+    assert pre_tanh.std() == pytest.approx(std, abs=5 * std / (2 * num) ** 0.5)
+
+
+def test_extreme_distributions_are_finite_and_have_finite_gradients():
+    mean, log_std = (grid.reshape(1, -1) for grid in jnp.meshgrid(jnp.array([-1e3, -20.0, 0.0, 20.0, 1e3]), jnp.array([-20.0, 2.0])))
+
+    def total(mean, log_std):
+        action, log_prob = ActionDistribution(mean=mean, log_std=log_std).sample(jax.random.key(0))
+        return jnp.sum(action) + jnp.sum(log_prob), (action, log_prob)
+
+    gradient, (action, log_prob) = jax.jit(jax.grad(total, argnums=(0, 1), has_aux=True))(mean, log_std)
+    chex.assert_tree_all_finite((gradient, action, log_prob))
+    assert np.abs(action).max() <= 1.0

@@ -1,0 +1,101 @@
+"""The documentation: its site builds without a warning, its examples run, and it speaks of no flag, file or module that is not there."""
+
+import dataclasses
+import glob
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from hindrl_jax.base.environments import Environment
+from hindrl_jax.tasks import presets
+from hindrl_jax.tasks.from_gymnasium import GymnasiumEnv
+
+ROOT = Path(__file__).parent.parent.parent
+README, *PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "docs" / "api").glob("*.md"))]
+FENCE = re.compile(r"```python\n(.*?)```", re.DOTALL)
+BLOCKS = {f"{path.name}:{i}": code for path in (README, *PAGES) for i, code in enumerate(FENCE.findall(path.read_text()))}
+# One that is the beginning of another is run with it.
+EXAMPLES = [name for name, code in BLOCKS.items() if not any(other.startswith(code) for other in BLOCKS.values() if other != code)]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The project's text, its generated pages and the site, in a folder of their own."""
+    folder = tmp_path_factory.mktemp("site")
+    ignored = shutil.ignore_patterns("generated", "__pycache__")
+    for name in ("docs", "notebooks", "benchmarks", "examples"):
+        shutil.copytree(ROOT / name, folder / name, ignore=ignored)
+    for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "mkdocs.yml"):
+        shutil.copy(ROOT / name, folder)
+    (folder / "hindrl_jax").symlink_to(ROOT / "hindrl_jax")
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1", "JAX_PLATFORMS": "cpu"}
+    for command in (["docs/generate.py"], ["-m", "mkdocs", "build", "--strict"]):  # with --quiet, warnings would not count
+        outcome = subprocess.run([sys.executable, *command], cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
+        assert outcome.returncode == 0, outcome.stdout + outcome.stderr
+    return folder
+
+
+def test_site_builds_without_a_warning(site):
+    core = (site / "site" / "api" / "core.html").read_text()
+    assert "Half-width of the goal box per dimension (thesis eq. 4.7)" in core
+    assert "(B,), factor of the bootstrapped value" in core  # a shape comment behind a field of Transition
+    commands = (site / "site" / "generated" / "command-line.html").read_text()
+    assert "--hindrl-sampling-strategy" in commands
+    assert "\x1b" not in commands
+
+
+def test_flags_exist(site):
+    """Every flag that the pages mention, of whatever command."""
+    commands = (site / "docs" / "generated" / "command-line.md").read_text()
+    known = set(re.findall(r"--[a-z][a-z0-9-]*", commands))
+    others = {"--ntasks-per-node", "--gpus-per-node"}  # SLURM's
+    others |= {"--gate-width", "--noise"}  # the example's own
+    others |= {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(GymnasiumEnv)}  # which has a page only where it is installed
+    others |= {"--only", "--help", "--logdir"}
+    for path in (README, *PAGES):
+        unknown = set(re.findall(r"(?<![\w-])--[a-z][a-z0-9-]*", path.read_text())) - known - others
+        assert not unknown, f"{path.name}: {unknown}"
+
+
+def test_every_module_has_a_page():
+    listed = {name for path in PAGES for name in re.findall(r"^::: (\S+)$", path.read_text(), re.M)}
+    files = [ROOT.joinpath(path) for path in glob.glob("hindrl_jax/**/*.py", root_dir=ROOT, recursive=True)]  # unlike rglob, follows links
+    modules = {".".join(path.relative_to(ROOT).with_suffix("").parts) for path in files}
+    modules = {name for name in modules if not name.endswith(("__init__", "__main__")) and not name.startswith("hindrl_jax.cli.")}
+    assert listed == modules
+
+
+def test_links_of_the_readme_lead_somewhere():
+    targets = re.findall(r"\]\(([^)#]+)[^)]*\)", README.read_text())
+    assert targets
+    assert [target for target in targets if "://" not in target and not (ROOT / target).exists()] == []
+
+
+@pytest.fixture
+def small(monkeypatch, tmp_path):
+    """Presets of hardly any steps."""
+    full = presets.preset
+
+    def preset(algo: str = "hindrl", name: str = "default", *, env: str | Environment = "FixedGridPickAndPlace"):
+        config = full(algo, name, env=env)
+        agent = dataclasses.replace(config.agent, net_arch=(8,))
+        batch = dataclasses.replace(config.batch, batch_size=16)
+        return dataclasses.replace(config, agent=agent, batch=batch, num_envs=2, learning_starts=200, steps=260, eval_every=40, eval_episodes=3)
+
+    monkeypatch.setattr(presets, "preset", preset)
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_example_runs(name, small):
+    exec(compile(BLOCKS[name], name, "exec"), {"__name__": "example"})
+
+
+def test_there_are_examples():
+    assert {"README.md:0", "quick-start.md:0", "demonstrations.md:0"} <= set(BLOCKS)
+    assert "README.md:0" not in EXAMPLES

@@ -1,0 +1,135 @@
+"""Presets: the thesis's numbers as its appendix prints them, and the quirks of the original code."""
+
+import dataclasses
+
+import pytest
+
+from hindrl_jax.base.errors import UserError
+from hindrl_jax.config import TrainConfig
+from hindrl_jax.tasks.presets import preset
+from hindrl_jax.tasks.registry import make
+
+# Appendix A.1.1 of the thesis, row by row.
+APPENDIX = {
+    "batch_size": 4_096,
+    "learning_rate": 1e-3,
+    "net_arch": (64, 64, 64, 64),
+    "top_quantiles_to_drop_per_net": 2,
+    "buffer_size": 500_000,
+    "learning_starts": 10_000,
+    "bc_weight": 1.0,
+    "max_demo_ratio": 0.1,
+    "reach_zero": 500_000,
+    "hindrl_sampling_strategy": "task_conditioned",
+    "m": 0,
+    "k": 0.0,
+}
+# Appendix A.1.2: where the robot task differs. The text of the appendix has lost one of its eight layers.
+APPENDIX_REACH = APPENDIX | {
+    "batch_size": 12_000,
+    "net_arch": (32, 32, 32, 32, 32, 32, 32, 32),
+    "top_quantiles_to_drop_per_net": 8,
+    "buffer_size": 1_000_000,
+    "learning_starts": 5_000,
+    "bc_weight": 0.0,
+    "reach_zero": 1_000_000,
+    "m": 5,
+}
+# What its text leaves to its framework (Stable-Baselines3 with sb3-contrib's TQC).
+FRAMEWORK = {
+    "gamma": 0.99,
+    "target_update_rate": 0.005,
+    "initial_alpha": 1.0,
+    "target_entropy": None,
+    "final_learning_rate": None,
+    "final_target_entropy": None,
+    "num_critics": 2,
+    "num_quantiles": 25,
+    "num_envs": 1,
+    "updates_per_iteration": 1,
+    "n_step": 1,
+    "terminate_on_relabel": False,
+    "layer_norm": False,
+    "input_encoding": "raw",
+    "actor_average_rate": 1.0,
+    "actor_average_span": 0.0,
+    "policy_input": "achieved_desired_observation",
+    "inclusive_goal_test": True,
+    "bc_loss": "squared",
+    "bc_action": "mean",
+    "behavioural_goals": "final_demonstration_states",
+}
+
+
+def flat(config: TrainConfig) -> dict:
+    values = {}
+    for name, value in dataclasses.asdict(config).items():
+        values.update(value if isinstance(value, dict) else {name: value})
+    return values
+
+
+@pytest.mark.parametrize(
+    ("env", "appendix"),
+    [
+        ("GridPickAndPlace", APPENDIX),
+        ("FixedGridPickAndPlace", APPENDIX),
+        ("ParameterizedReach", APPENDIX_REACH),
+        ("FixedParameterizedReach", APPENDIX_REACH),
+    ],
+)
+@pytest.mark.parametrize(("algo", "relabelled", "filtered"), [("tqcfd", 0, False), ("hindrl", 4, False), ("smooth-hindrl", 4, True)])
+def test_thesis_preset_is_the_appendix(algo, relabelled, filtered, env, appendix):
+    values = flat(preset(algo, "thesis", env=env))
+    expected = appendix | FRAMEWORK | {"algo": algo, "num_sampled_goals": relabelled, "epsilon_filtering": filtered}
+    assert {name: values[name] for name in expected} == expected
+
+
+@pytest.mark.parametrize("env", ["FixedGridPickAndPlace", "FixedParameterizedReach"])
+def test_thesis_bc_is_the_appendix(env):
+    values = flat(preset("bc", "thesis", env=env))
+    assert (values["batch_size"], values["learning_rate"], values["net_arch"]) == (2_048, 1e-3, (32, 32))
+
+
+@pytest.mark.parametrize(("env", "more"), [("FixedGridPickAndPlace", {}), ("FixedParameterizedReach", {"misalign_demo_actions": True})])
+def test_original_preset_differs_from_the_thesis_by_the_quirks_alone(env, more):
+    thesis, original = flat(preset("hindrl", "thesis", env=env)), flat(preset("hindrl", "original", env=env))
+    assert {name: original[name] for name in original if original[name] != thesis[name]} == {
+        "inclusive_goal_test": False,
+        "timeouts_are_terminal": True,
+        "behavioural_goals": "task",
+        "exclude_last_goal": True,
+        "rescale_demo_actions": False,
+        "bc_loss": "norm",
+        "bc_action": "sample",
+    } | more
+
+
+def test_default_recipes_differ_by_family_and_the_grid_has_the_defaults_of_the_config():
+    second_life = dataclasses.replace(TrainConfig(), steps=240_000, agent_resets=(1 / 3,))
+    assert preset("hindrl", env="GridPickAndPlace") == preset("hindrl") == second_life
+    fixed, retold = preset("hindrl", env="FixedParameterizedReach"), preset("hindrl", env="ParameterizedReach")
+    assert preset("hindrl", env=make("ParameterizedReach", num_waypoints=1)) == retold
+    assert len({TrainConfig(), fixed, retold}) == 3  # what has happened is told anew there, in part about demonstrated states
+    assert retold.batch.hindrl_sampling_strategy == "joint_union"
+    assert preset("bc", env="ParameterizedReach") == preset("bc", env="FixedParameterizedReach")
+    assert retold.demo_reset_ratio > 0.0
+    assert preset("tqcfd", env="ParameterizedReach") == preset("tqcfd", env="FixedParameterizedReach")
+    assert preset("tqcfd", env="ParameterizedReach").batch.num_sampled_goals == 0.0
+
+
+def test_field_names_are_unique_across_the_nested_configs():
+    """So that each can be a flag of its own."""
+    config = preset()
+    assert len(flat(config)) == sum(
+        len(dataclasses.fields(getattr(config, field.name))) if dataclasses.is_dataclass(getattr(config, field.name)) else 1
+        for field in dataclasses.fields(config)
+    )
+
+
+def test_unknown_names_are_refused():
+    with pytest.raises(UserError, match="did you mean 'hindrl'"):
+        preset("hindlr")
+    with pytest.raises(UserError, match="unknown preset"):
+        preset("hindrl", "paper")
+    with pytest.raises(UserError, match="unknown environment"):
+        preset("hindrl", env="Reach")

@@ -1,0 +1,192 @@
+"""Learning in environments that are stepped outside JAX."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+from point_env import CONFIG, SPEED, to_goal
+
+import hindrl_jax as hindrl
+from hindrl_jax import cli
+from hindrl_jax.base.errors import UserError
+from hindrl_jax.runs.checkpoints import Checkpoints
+from hindrl_jax.tasks.from_gymnasium import Simulators
+from hindrl_jax.training.host import play, record_gymnasium
+
+POINT = "gymnasium:point_env:PointGoal-v0"
+
+
+@pytest.fixture(scope="module")
+def env():
+    return hindrl.make(POINT)
+
+
+@pytest.fixture(scope="module")
+def demonstrations(env):
+    return record_gymnasium(env, to_goal, 5, seed=1)
+
+
+def with_batch(config, **values):
+    return dataclasses.replace(config, batch=dataclasses.replace(config.batch, **values))
+
+
+def test_demonstrations_are_what_the_policy_did_up_to_the_goal(env, demonstrations):
+    assert demonstrations.observations.shape == (5, 11, 5)
+    assert demonstrations.actions.shape == (5, 10, 2)
+    for i, length in enumerate(demonstrations.lengths):
+        places = demonstrations.observations[i, : length + 1, :2]
+        np.testing.assert_allclose(np.diff(places, axis=0), SPEED * demonstrations.actions[i, :length], atol=1e-6)  # actions in [-1, 1]
+        distance = np.linalg.norm(places - demonstrations.desired_goals[i], axis=1)
+        assert (distance[:-1] > 0.2).all() or length == 1  # an episode may begin at its goal, and is judged after its first step
+        assert distance[-1] <= 0.2
+        np.testing.assert_array_equal(demonstrations.rewards[i], np.arange(10) == length - 1)
+    assert demonstrations.terminated.all()
+    again = record_gymnasium(env, to_goal, 5, seed=1)
+    np.testing.assert_array_equal(again.observations, demonstrations.observations)
+
+
+def test_a_policy_that_reaches_nothing_is_told_so(env):
+    with pytest.raises(UserError, match="only 0 of 3 episodes"):
+        record_gymnasium(env, lambda observation, rng: [0.0, 0.0], 1, max_attempts=3, seed=3)
+
+
+def test_every_environment_plays_as_many_episodes(env):
+    """Of two environments, each three episodes; the policy of the second stands still, so that all its episodes last to the horizon."""
+    two = Simulators(env, 2)
+    success, length = play(two, np.array([1, 2]), lambda o, g: np.clip((g - o[:, 3:]) / SPEED, -1, 1) * 2 * np.array([[1], [0]]), 3)
+    two.close()
+    assert success[0].all()
+    assert (length[0] <= 4).all()
+    assert (length[1] == 10).all() or success[1].any()
+    assert success.shape == length.shape == (2, 3)
+
+
+@pytest.fixture(scope="module")
+def trained(env, demonstrations):
+    return hindrl.fit(env, demonstrations, CONFIG, seeds=[0, 7])
+
+
+def check_replay(replay, *, at_least):
+    """Moves follow from actions, goals stay for an episode, and rewards are where goals are reached: for each environment of each seed."""
+    episodes, num_complete = replay.episodes, 0
+    for seed, lengths in enumerate(episodes.lengths):
+        for row in np.flatnonzero(lengths):
+            length = lengths[row]
+            places, actions = episodes.observations[seed, row, : length + 1, :2], episodes.actions[seed, row, :length]
+            np.testing.assert_allclose(places[1:], np.clip(places[:-1] + SPEED * actions, -1, 1), atol=1e-5)
+            reached = np.linalg.norm(places[1:] - episodes.desired_goals[seed, row], axis=1) <= 0.2 + 1e-6
+            np.testing.assert_array_equal(episodes.rewards[seed, row, :length], reached)
+            np.testing.assert_array_equal(reached, (np.arange(length) == length - 1) & episodes.terminated[seed, row])
+            assert length == 10 or episodes.terminated[seed, row]
+            num_complete += 1
+    assert num_complete >= at_least
+
+
+def test_the_replay_holds_what_the_environments_went_through(trained):
+    replay = jax.device_get(trained.state.replay)
+    check_replay(replay, at_least=40)
+    assert not np.array_equal(*replay.episodes.observations)  # each seed lives its own episodes
+
+
+def test_a_run_is_told_like_others(trained):
+    assert trained.env_steps >= 240
+    assert trained.updates == 2 * (trained.env_steps - 40) // 4
+    assert [row.seed for row in trained.rows] == [0, 7] * (len(trained.rows) // 2)
+    assert {"critic/loss", "batch/relabelled"} <= trained.rows[0].metrics.keys()
+    assert trained.final_success.shape == (2,)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(jax.device_get(trained.state.agent)))
+
+
+def test_a_seed_gives_the_same_run_alone_and_goes_on_after_a_stop(env, demonstrations, trained, tmp_path):
+    checkpoints = Checkpoints(tmp_path, seconds=0.0)
+
+    def stop_half_way(result):
+        checkpoints.save_when_due(result)
+        if result.env_steps > 120:
+            raise KeyboardInterrupt
+
+    stopped = []
+    with pytest.raises(KeyboardInterrupt):
+        hindrl.fit(env, demonstrations, CONFIG, seeds=[7], report=lambda result: (stopped.append(result), stop_half_way(result)))
+    alone, beside = stopped[-1].rows[0], trained.rows[1]
+    assert alone.episode_length == beside.episode_length
+    np.testing.assert_allclose(alone.metrics["critic/loss"], beside.metrics["critic/loss"], rtol=1e-2)
+
+    resumed = hindrl.fit(env, demonstrations, CONFIG, seeds=[7], restore=checkpoints.restore)
+    assert resumed.rows[0] == alone
+    assert resumed.env_steps == trained.env_steps
+    check_replay(jax.device_get(resumed.state.replay), at_least=20)
+
+
+def test_a_run_by_the_command_line_can_be_played_and_filmed(env, demonstrations, tmp_path, capsys):
+    file, out = tmp_path / "demos.hdf5", tmp_path / "run"
+    hindrl.save_demonstrations(file, demonstrations, env=env, env_args=dataclasses.asdict(env))
+    flags = "--steps 120 --num-envs 4 --learning-starts 40 --eval-every 60 --eval-episodes 3 --net-arch 8 --batch-size 16 --buffer-size 400"
+    cli.main(["train", "--env", POINT, "--horizon", "8", "--demos", str(file), "--out", str(out), *flags.split()])
+    run = hindrl.load_run(out)
+    assert run.spec.env == hindrl.make(POINT, horizon=8)
+    assert run.spec.config.goal.epsilon == pytest.approx(0.1414)
+    assert {"config.json", "parameters.npz", "episode.gif", "curve.png"} <= {path.name for path in out.iterdir()}
+    outcomes = run.evaluate(episodes=5)
+    assert run.evaluate(episodes=5) == outcomes
+    assert [outcome["seed"] for outcome in outcomes] == [0]
+    assert outcomes[0]["episode_length"] <= 8
+    cli.main(["render", str(out), "--to", str(tmp_path / "film.gif")])
+    with Image.open(tmp_path / "film.gif") as film:
+        assert film.size == (20, 20)
+    cli.main(["eval", str(out), "--episodes", "3", "--stochastic"])
+    assert POINT in capsys.readouterr().out
+    for refused, message in [
+        (["demos", "render", str(file)], "hold no states"),
+        (["train", "--env", POINT, "--demos", "1"], "no expert is known"),
+        (["demos", "record", "--env", POINT, "--demos", "1", "--out", str(tmp_path / "x.hdf5")], "no expert is known"),
+        (["train", "--env", POINT, "--demos", str(file), "--demo-reset-ratio", "0.5"], "states are not known"),
+        (["eval", str(out), "--backend", "robosuite"], "one back end"),
+    ]:
+        with pytest.raises(SystemExit):
+            cli.main(refused)
+        assert message in capsys.readouterr().err
+
+
+def test_cloning_needs_no_environment_but_to_be_judged(env):
+    config = dataclasses.replace(
+        hindrl.preset("bc", env=env), steps=600, eval_every=300, num_envs=4, agent=dataclasses.replace(CONFIG.agent, net_arch=(32, 32))
+    )
+    result = hindrl.fit(env, record_gymnasium(env, to_goal, 40), config)
+    assert result.env_steps == 0
+    assert result.final_success[0] > 0.6
+
+
+def test_other_levers_work_as_well(env, demonstrations):
+    """All at once, since each would be compiled for long."""
+    batch = dict(priority_exponent=0.5, hindrl_sampling_strategy="mixture", strategy_mixture=(("joint_intersection", 1.0), ("future", 1.0)))
+    goal = dataclasses.replace(CONFIG.goal, achieved_goal_ratio=0.5)
+    config = dataclasses.replace(with_batch(CONFIG, **batch), goal=goal, bc_warm_start=3, pretrain_updates=4, steps=120)
+    result = hindrl.fit(env, demonstrations, config)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(jax.device_get(result.state.agent)))
+    replay = jax.device_get(result.state.replay)
+    assert result.updates == 3 + 4 + 2 * (result.env_steps - 40) // 4
+    assert (replay.nearby_goals >= 0).any()
+    complete = replay.episodes.lengths[0] > 0
+    assert 0.1 < replay.judged_by_goal[0, complete].mean() < 0.9  # the goals of these episodes were chosen here, and kept
+    assert len(np.unique(replay.episodes.desired_goals[0, complete], axis=0)) == complete.sum()
+
+
+def test_what_cannot_be_had_is_refused(env, demonstrations):
+    own = hindrl.make("FixedGridPickAndPlace")
+    for where, config, message in [
+        (env, dataclasses.replace(CONFIG, demo_reset_ratio=0.5), "whose states are not known"),
+        (env, dataclasses.replace(CONFIG, random_truncation=0.1), r"random_truncation = 0\.1 is for environments in JAX"),
+        (env, dataclasses.replace(CONFIG, agent_resets=(0.5,)), "agent_resets = .* is for environments in JAX"),
+        (env, dataclasses.replace(CONFIG, goal=dataclasses.replace(CONFIG.goal, behavioural_goals="task")), "choose environment"),
+        (own, CONFIG, "gives its episodes no goals"),
+    ]:
+        table = demonstrations if where is env else hindrl.record_demonstrations(own, 1)
+        with pytest.raises(UserError, match=message):
+            hindrl.fit(where, table, config)
+    with pytest.raises(UserError, match="no expert is known"):
+        hindrl.record_demonstrations(env, 1)
+    with pytest.raises(UserError, match="choose default"):
+        hindrl.preset("hindrl", "thesis", env=env)
