@@ -38,7 +38,7 @@ def run(options: Options) -> list[Row]:
 
     loop = Loop(dataclasses.replace(config, buffer_size=12_800) if options.quick else config, full=True)
     print(f"{TITLE}: replay.sample_batch, batch {BATCH_SIZE}, from a full replay of {loop.capacity:,} transitions", flush=True)
-    batches = {"off": dataclasses.replace(config.batch, batch_size=BATCH_SIZE, num_sampled_goals=0.0)} | {
+    batches = {"off": dataclasses.replace(config.batch, batch_size=BATCH_SIZE, relabelled_per_original=0.0)} | {
         strategy: dataclasses.replace(config.batch, batch_size=BATCH_SIZE, hindrl_sampling_strategy=strategy)
         for strategy in (STRATEGIES[-2:-1] if options.quick else STRATEGIES[:-1])  # an intersection needs what the loop notes while it lives
     }
@@ -50,7 +50,7 @@ def run(options: Options) -> list[Row]:
     env = loop.env
     demonstrations = hindrl_jax.record_demonstrations(env, max(NUM_DEMONSTRATIONS))
     achieved = env.achieved_goal(demonstrations.observations)
-    epsilon = goals.epsilon_from_demonstrations(achieved, demonstrations.lengths, m=5, k=0.0)
+    epsilon = goals.epsilon_from_demonstrations(achieved, demonstrations.lengths, steps=5, deviations=0.0)
     contestants = {number: _filter(achieved[:number], epsilon) for number in NUM_DEMONSTRATIONS}
     rows += [
         {"what": "epsilon_filter", "demonstrations": number} | result for number, result in timing.take_turns(contestants, options.effort).items()

@@ -1,6 +1,6 @@
 """A task of your own: out of the left room through a gate that is elsewhere in every episode, to a target in the right room.
 
-hindrl train --env two_rooms:TwoRooms --demos 3 --m 3 --demo-reset-ratio 0.5 --steps 40000
+hindrl train --env two_rooms:TwoRooms --demos 3 --epsilon-steps 3 --demo-reset-ratio 0.5 --steps 40000
 """
 
 import dataclasses

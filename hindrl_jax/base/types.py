@@ -46,13 +46,15 @@ class Transition(struct.PyTreeNode, kw_only=True):
     """A batch of (n-step) transitions, ready for the losses."""
 
     observation: Array  # (B, D)
+    achieved_goal: Array  # (B, G), where the observation is
     action: Array  # (B, A), in [-1, 1]
     reward: Array  # (B,), sum of the discounted rewards of the n steps
     discount: Array  # (B,), factor of the bootstrapped value: gamma**steps, or 0 after termination
     next_observation: Array  # (B, D)
+    next_achieved_goal: Array  # (B, G)
     desired_goal: Array  # (B, G)
     is_demonstration: Array  # (B,) bool
-    is_relabelled: Array  # (B,) bool, whether the goal, or what the observations are about, was chosen in hindsight
+    is_relabelled: Array  # (B,) bool, whether the goal, or the observations, are those of hindsight
     obtained_return: Array | None = None  # (B,), the discounted return that the episode went on to obtain; None where it is not used
     weight: Array | None = None  # (B,), in [0, 1], of the row in the critics' loss; None for equal weights
 

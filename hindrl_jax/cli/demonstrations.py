@@ -20,7 +20,7 @@ from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.files import check_can_write, disk_trouble
 from hindrl_jax.base.types import Episodes
 from hindrl_jax.cli.common import ENV_HELP, console, counted, env_names, episode_key, parse, peek
-from hindrl_jax.core.goals import epsilon_filter, epsilon_from_demonstrations, goal_table
+from hindrl_jax.core.goals import epsilon_filter, epsilon_from_demonstrations, is_visited
 from hindrl_jax.demonstrations.convert import (
     MINARI_PREFIX,
     ForeignRecording,
@@ -116,16 +116,16 @@ class Info:
 
     source: tyro.conf.Positional[str]
     """The file, of hindrl_jax or another tool (.hdf5, .npz), or minari:NAME-v0."""
-    m: int = 0
-    """Distance in steps for epsilon (thesis eq. 4.7)."""
-    k: float = 0.0
-    """Weight of the standard deviation in epsilon (thesis eq. 4.7)."""
+    epsilon_steps: int = 0
+    """Distance in steps for epsilon (m of thesis eq. 4.7)."""
+    epsilon_deviations: float = 0.0
+    """Weight of the standard deviation in epsilon (k of thesis eq. 4.7)."""
 
 
 def info(arguments: list[str]) -> None:
     """Say what a file of demonstrations holds."""
     options, meaning, env = _parse_with_meaning(Info, arguments, "hindrl demos info", info.__doc__)
-    _check_epsilon(options.m, options.k)
+    _check_epsilon(options)
     found = open_source(options.source)
     if isinstance(found, ForeignRecording):
         _print_foreign(found)
@@ -160,8 +160,8 @@ def _print_foreign(found: ForeignRecording) -> None:
 
 def _print_recording(options: Info, recording: Recording) -> None:
     summary = summarise_recording(options.source, recording)
-    achieved, lengths, epsilon = _goals(recording, m=options.m, k=options.k)
-    filtered = goal_table(achieved, lengths, epsilon, filtered=True)
+    achieved, lengths, epsilon = _goals(recording, options)
+    kept = is_visited(lengths, achieved.shape[1]) & jax.vmap(lambda path: epsilon_filter(path, epsilon))(achieved)
     own = ":" in summary.env_name and not summary.env_name.startswith("gymnasium:")  # "module:Name", a task of the user's own
     ours = own or summary.env_name in TASKS
     arguments = ", ".join(f"{name}={value}" for name, value in summary.env_kwargs.items()) if ours else "..."
@@ -175,7 +175,7 @@ def _print_recording(options: Info, recording: Recording) -> None:
         console.print(f"expert: {', '.join(f'{name}={value}' for name, value in summary.expert.items())}")
     if recording.converted_from:
         console.print(f"converted from {recording.converted_from['format']}")
-    console.print(f"the filter keeps {int(filtered.count)} of {int(jnp.sum(lengths + 1))} goals (m = {options.m}, k = {options.k:g})")
+    console.print(f"the filter keeps {int(jnp.sum(kept))} of {int(jnp.sum(lengths + 1))} goals ({_how(options)})")
     reached = np.concatenate([demo.achieved_goals for demo in recording.demonstrations])
     columns = {
         "observation": _ranges(summary.observation_low, summary.observation_high),
@@ -205,10 +205,10 @@ class PlotDemo:
     """The .png file (default: the file's name with .png)."""
     demo: int = 0
     """Which demonstration, counted from 0."""
-    m: int = 5
-    """Distance in steps for epsilon (thesis eq. 4.7), over all demonstrations of the file."""
-    k: float = 0.0
-    """Weight of the standard deviation in epsilon (thesis eq. 4.7)."""
+    epsilon_steps: int = 5
+    """Distance in steps for epsilon (m of thesis eq. 4.7), over all demonstrations of the file."""
+    epsilon_deviations: float = 0.0
+    """Weight of the standard deviation in epsilon (k of thesis eq. 4.7)."""
     dims: tuple[int, int] | None = None
     """The two goal dimensions to draw (default: those with the largest extent)."""
 
@@ -219,7 +219,7 @@ def plot(arguments: list[str]) -> None:
     path = options.to or _beside(options.source, ".png")
     if path.suffix != ".png":
         raise UserError(f"cannot draw {path.name}: the name must end in .png")
-    _check_epsilon(options.m, options.k)
+    _check_epsilon(options)
     recording = read(options.source, meaning, env)
     _check_demo(options.demo, len(recording.demonstrations), options.source)
     goals = recording.demonstrations[options.demo].achieved_goals
@@ -228,9 +228,9 @@ def plot(arguments: list[str]) -> None:
     dims = options.dims or tuple(sorted(int(dim) for dim in np.argsort(-np.ptp(_continuous(goals), axis=0), kind="stable")[:2]))
     if len(set(dims)) < 2 or not all(0 <= dim < goals.shape[1] for dim in dims):
         raise UserError(f"--dims {dims[0]} {dims[1]} is not usable: give two different numbers from 0 to {goals.shape[1] - 1}")
-    _, _, epsilon = _goals(recording, m=options.m, k=options.k)
+    _, _, epsilon = _goals(recording, options)
     kept = np.asarray(epsilon_filter(jnp.asarray(goals, jnp.float32), epsilon))
-    title = f"{recording.env_name}, demonstration {options.demo}, m = {options.m}, k = {options.k:g}"
+    title = f"{recording.env_name}, demonstration {options.demo}, {_how(options)}"
     with disk_trouble(path):
         save_filter(goals, kept, np.asarray(epsilon), path, dims=dims, title=title)
     console.print(f"wrote {path}: the filter keeps {kept.sum()} of {len(kept)} goals")
@@ -247,17 +247,25 @@ def _continuous(goals: np.ndarray) -> np.ndarray:
     return goals if whole.all() else np.where(whole[None], 0.0, goals)
 
 
-def _goals(recording: Recording, *, m: int, k: float) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _goals(recording: Recording, options: Info | PlotDemo) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The goals (N, T + 1, G) that the demonstrations achieved, their lengths (N,), and epsilon (G,) over all of them."""
     demos = recording.demonstrations
     lengths = jnp.asarray([len(demo) for demo in demos])
     achieved = jnp.asarray(padded([demo.achieved_goals for demo in demos], max(len(demo) for demo in demos) + 1))
-    return achieved, lengths, epsilon_from_demonstrations(achieved, lengths, m=m, k=k)
+    epsilon = epsilon_from_demonstrations(achieved, lengths, steps=options.epsilon_steps, deviations=options.epsilon_deviations)
+    return achieved, lengths, epsilon
 
 
-def _check_epsilon(m: int, k: float) -> None:
-    if m < 0 or k < 0:
-        raise UserError(f"--m {m} --k {k} is not usable: both must be 0 or more")
+def _check_epsilon(options: Info | PlotDemo) -> None:
+    if options.epsilon_steps < 0 or options.epsilon_deviations < 0:
+        raise UserError(
+            f"--epsilon-steps {options.epsilon_steps} --epsilon-deviations {options.epsilon_deviations} is not usable: both must be 0 or more"
+        )
+
+
+def _how(options: Info | PlotDemo) -> str:
+    """How epsilon was made."""
+    return f"epsilon over {options.epsilon_steps} steps with {options.epsilon_deviations:g} deviations"
 
 
 def _parse_with_meaning(

@@ -7,6 +7,8 @@ Follows thesis section 4.1.2 and algorithm 6 (after Davchev et al., HinDRL, 2021
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -37,30 +39,30 @@ def goal_reached(achieved_goal: Array, desired_goal: Array, epsilon: Array, *, i
     return jnp.all(within, axis=-1)
 
 
-def epsilon_from_demonstrations(achieved_goals: Array, lengths: Array, *, m: int, k: float) -> Array:
+def epsilon_from_demonstrations(achieved_goals: Array, lengths: Array, *, steps: int, deviations: float) -> Array:
     """Half-width of the goal box per dimension (thesis eq. 4.7).
 
     epsilon_i = mean |z_{t+m,i} - z_{t,i}| + k * std |z_{t+m,i} - z_{t,i}|, mean and (population) deviation pooled over all pairs of all
-    demonstrations. With m = 0 it is zero. If no demonstration has m steps there are no pairs and epsilon is zero.
+    demonstrations; m is `steps` and k is `deviations`. With m = 0 it is zero. If no demonstration has m steps there are no pairs and epsilon is zero.
 
     Args:
       achieved_goals: (N, T + 1, G) goals along the demonstrations, padded.
       lengths: (N,) int32 number of transitions; demonstration n holds lengths[n] + 1 goals.
-      m: distance in steps between the paired goals, >= 0.
-      k: weight of the deviation.
+      steps: distance between the paired goals, >= 0.
+      deviations: weight of the deviation.
 
     Returns:
       (G,) float32, in task units.
     """
     num_goals, goal_dim = achieved_goals.shape[1], achieved_goals.shape[2]
-    if m >= num_goals:
+    if steps >= num_goals:
         return jnp.zeros(goal_dim, jnp.float32)
-    distance = jnp.abs(achieved_goals[:, m:] - achieved_goals[:, : num_goals - m])  # (N, T + 1 - m, G)
-    is_pair = (jnp.arange(num_goals - m)[None] + m <= lengths[:, None])[..., None]
+    distance = jnp.abs(achieved_goals[:, steps:] - achieved_goals[:, : num_goals - steps])  # (N, T + 1 - m, G)
+    is_pair = (jnp.arange(num_goals - steps)[None] + steps <= lengths[:, None])[..., None]
     count = jnp.maximum(jnp.sum(is_pair), 1)
     mean = jnp.sum(jnp.where(is_pair, distance, 0.0), axis=(0, 1)) / count
     variance = jnp.sum(jnp.where(is_pair, jnp.square(distance - mean.reshape(1, 1, -1)), 0.0), axis=(0, 1)) / count
-    return mean + k * jnp.sqrt(variance)
+    return mean + deviations * jnp.sqrt(variance)
 
 
 def epsilon_filter(achieved_goals: Array, epsilon: Array, *, inclusive: bool = True) -> Array:
@@ -91,6 +93,19 @@ def epsilon_filter(achieved_goals: Array, epsilon: Array, *, inclusive: bool = T
     return jnp.concatenate([jnp.ones(1, bool), keep_rest])
 
 
+class GoalTest(struct.PyTreeNode, kw_only=True):
+    """When a goal of hindsight counts as reached, and what that means for the return."""
+
+    achieved_goal: Callable[[Array], Array] = struct.field(pytree_node=False)  # projection of observations (..., D) to goals (..., G)
+    epsilon: Array  # (G,) half-width of the goal box
+    inclusive: bool = struct.field(pytree_node=False, default=True)  # which box test, see `goal_reached`
+    ends_return: bool = struct.field(pytree_node=False, default=True)  # whether the return ends where the goal is reached
+
+    def reached(self, observations: Array, goals: Array) -> Array:
+        """Whether goals (..., G) are reached at observations (..., D): (...) bool."""
+        return goal_reached(self.achieved_goal(observations), goals, self.epsilon, inclusive=self.inclusive)
+
+
 class GoalTable(struct.PyTreeNode, kw_only=True):
     """Goals to draw from: the first `count` rows, in the order in which the demonstrations reached them."""
 
@@ -104,40 +119,24 @@ def is_visited(lengths: Array, num_states: int) -> Array:
     return jnp.arange(num_states)[None] <= lengths[:, None]
 
 
-def goal_table(
-    achieved_goals: Array,
-    lengths: Array,
-    epsilon: Array,
-    *,
-    filtered: bool,
-    exclude_last: bool = False,
-    inclusive: bool = True,
-    observations: Array | None = None,
-) -> GoalTable:
+def goal_table(observations: Array, achieved_goals: Array, keep: Array) -> GoalTable:
     """Collects the goals that the demonstrations reach: the database G_db of the thesis, smoothed or not.
 
     Args:
-      achieved_goals: (N, T + 1, G) goals along the demonstrations, padded.
-      lengths: (N,) int32 number of transitions.
-      epsilon: (G,) half-width of the goal box.
-      filtered: apply `epsilon_filter` (Smooth HinDRL).
-      exclude_last: leave out the last goal of each demonstration, as the original code does by mistake.
-      inclusive: which box test the filter uses.
-      observations: (N, T + 1, D) to keep beside the goals, if any.
+      observations: (N, T + 1, D) states along the demonstrations, padded.
+      achieved_goals: (N, T + 1, G) the goals that they reach.
+      keep: (N, T + 1) bool, which of them are goals: `is_visited`, and for Smooth HinDRL `epsilon_filter`, too.
 
     Returns:
       A table with M = N * (T + 1) rows, of which `count` are goals.
     """
-    keep = is_visited(lengths - int(exclude_last), achieved_goals.shape[1])
-    if filtered:
-        keep &= jax.vmap(lambda goals: epsilon_filter(goals, epsilon, inclusive=inclusive))(achieved_goals)
     keep = keep.reshape(-1)
     order = jnp.argsort(~keep, stable=True)
 
     def kept(values: Array) -> Array:
         return values.reshape(-1, values.shape[-1])[order]
 
-    return GoalTable(goals=kept(achieved_goals), count=jnp.sum(keep), observations=None if observations is None else kept(observations))
+    return GoalTable(goals=kept(achieved_goals), count=jnp.sum(keep), observations=kept(observations))
 
 
 def final_goals(achieved_goals: Array, lengths: Array) -> GoalTable:
@@ -156,27 +155,26 @@ def sample_goals(key: Array, table: GoalTable, num_goals: int) -> Array:
     return table.goals[uniform_index(key, (num_goals,), table.count)]
 
 
-def nearby_goal(key: Array, table: GoalTable, achieved_goals: Array, epsilon: Array, *, inclusive: bool = True) -> Array:
-    """Picks, for each achieved goal, one of the table's goals in whose box it lies, uniformly.
+def nearby_goal(key: Array, table: GoalTable, observations: Array, test: GoalTest) -> Array:
+    """Picks, for each observation, one of the table's goals that count as reached there, uniformly.
 
     Args:
       key: random key; the choices of one call use the same random order of the table.
       table: M rows.
-      achieved_goals: (E, G).
-      epsilon: (G,) half-width of the goal box.
-      inclusive: which box test, see `goal_reached`.
+      observations: (E, D).
+      test: when a goal counts as reached.
 
     Returns:
       (E,) int32 row of the table, -1 where no goal is near.
     """
-    num_goals = table.goals.shape[0]
+    achieved_goals, num_goals = test.achieved_goal(observations), table.goals.shape[0]
     index_bits = num_goals.bit_length()
     row = jnp.arange(num_goals, dtype=jnp.uint32)
     # The row's number plus 1, below random bits: the maximum over rows is a random row, and says which.
     label = (jax.random.bits(key, (num_goals,)) << index_bits) | (row + 1)
     label = jnp.where(row < table.count, label, 0)
     near = jnp.ones((achieved_goals.shape[0], num_goals), bool)
-    for goal, reference, width in zip(achieved_goals.T, table.goals.T, epsilon, strict=True):  # dimension by dimension, over long rows
-        near &= goal_reached(goal[:, None, None], reference[None, :, None], width[None], inclusive=inclusive)
+    for goal, reference, width in zip(achieved_goals.T, table.goals.T, test.epsilon, strict=True):  # dimension by dimension, over long rows
+        near &= goal_reached(goal[:, None, None], reference[None, :, None], width[None], inclusive=test.inclusive)
     chosen = jnp.max(jnp.where(near, label[None], 0), axis=1)
     return (chosen & jnp.uint32(2**index_bits - 1)).astype(jnp.int32) - 1

@@ -1,6 +1,4 @@
-"""Hindsight relabelling: which goal a transition is told, after the fact, to have been meant for.
-
-Sources of goals (Andrychowicz et al., HER, 2017; Davchev et al., HinDRL, 2021; thesis sections 2.3.3 and 4.1.2):
+"""Sources of goals for relabelling (Andrychowicz et al., HER, 2017; Davchev et al., HinDRL, 2021; thesis sections 2.3.3 and 4.1.2):
 
     final               the last goal reached in the transition's own episode
     future              a goal reached later in that episode; the thesis's "rollout-conditioned" (eq. 4.3)
@@ -10,24 +8,75 @@ Sources of goals (Andrychowicz et al., HER, 2017; Davchev et al., HinDRL, 2021; 
     joint_intersection  a goal reached later in that episode that lies within epsilon of a demonstrated one, or the demonstrated one itself
 
 The strategy joint_union takes task_conditioned with probability `union_sampling_ratio`, else future (eq. 4.4); mixture takes any sources with any
-weights. A row whose intersection is empty is not relabelled. What lies within epsilon of what is noted while an episode is lived
-(`goals.nearby_goal`), which makes the intersection, "exceptionally slow" in the thesis, nearly as cheap as the others. Differences from HinDRL in the
-form that takes demonstrated goals: one goal near each state is noted for good, so a goal is drawn by the states that it lies near.
-
-Where observations hold what an episode is about (`types.RetellableEnvironment`), states from the same sources take the place of that, and no goal is
-changed; intersections, which compare goals, have no meaning there.
+weights. A row whose intersection is empty is not relabelled. For intersections, the replay notes for each transition a demonstrated goal near its end
+(`NEARBY_GOAL`), which makes them, "exceptionally slow" in the thesis, nearly as cheap as the others. Difference from HinDRL in the form that takes
+demonstrated goals: one goal near each state is noted for good, so a goal is drawn by the states that it lies near.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
 
-from hindrl_jax.base.types import Array
+from hindrl_jax.base.types import Array, tree_where
+from hindrl_jax.config import BatchConfig, Source
+from hindrl_jax.core.goals import GoalTable
 from hindrl_jax.core.randomness import uniform_index
+from hindrl_jax.core.replay import ReplayState, sample_episodes
+
+GoalSource = Callable[[Array, ReplayState, Array, Array], tuple[Array, Array]]
+"""(key, replay, rows, steps) -> (observations, found): for transitions, given by episode and step, (...) int32, states (..., D) whose achieved goals
+are to be the new goals, and (...) bool whether there are such. Several states of one row, (B, J), that come from its own episode are in order of
+time."""
+
+NEARBY_GOAL = "nearby_goal"
+"""The note of the replay that intersections need: a row of the goal table that is near the transition's end, or -1."""
+
+
+def goal_source(table: GoalTable, config: BatchConfig) -> GoalSource:
+    """The source that a config asks for: one, or a mixture.
+
+    Args:
+      table: the demonstrations' goals, with their observations.
+      config: strategy and weights.
+    """
+    sources, weights = zip(*config.sources, strict=True)
+    draw = [_single_source(source, table, config) for source in sources]
+
+    def mixed(key: Array, replay: ReplayState, rows: Array, steps: Array) -> tuple[Array, Array]:
+        key_choice, *keys = jax.random.split(key, len(sources) + 1)
+        choice = choose_sources(key_choice, rows.shape[0], weights)
+        drawn = draw[0](keys[0], replay, rows, steps)
+        for index in range(1, len(sources)):
+            drawn = tree_where(choice == index, draw[index](keys[index], replay, rows, steps), drawn)
+        return drawn
+
+    return mixed
+
+
+def _single_source(source: Source, table: GoalTable, config: BatchConfig) -> GoalSource:
+    def draw(key: Array, replay: ReplayState, rows: Array, steps: Array) -> tuple[Array, Array]:
+        key_row, key_step = jax.random.split(key)
+        lengths, observations, found = replay.episodes.lengths, replay.episodes.observations, jnp.ones(rows.shape, bool)
+        if source == "task_conditioned":
+            return table.observations[uniform_index(key_row, rows.shape, table.count)], found
+        if source == "random":
+            others = sample_episodes(key_row, replay, rows.size).reshape(rows.shape)
+            chosen = hindsight_steps(key_step, jnp.zeros_like(others), lengths[others], source="episode")
+            return observations[others, chosen], found
+        if source == "joint_intersection":
+            nearby = replay.notes[NEARBY_GOAL][rows]
+            chosen, found = intersection_steps(key_step, steps, lengths[rows], nearby >= 0)
+            if config.intersection_goals == "rollout":
+                return observations[rows, chosen], found
+            return table.observations[jnp.take_along_axis(nearby, chosen[:, None] - 1, axis=1)[:, 0]], found
+        chosen = hindsight_steps(key_step, steps, lengths[rows], source=source)
+        return observations[rows, jnp.sort(chosen, axis=-1) if chosen.ndim > 1 else chosen], found
+
+    return draw
 
 
 def hindsight_steps(key: Array, steps: Array, lengths: Array, *, source: Literal["final", "future", "episode"]) -> Array:
@@ -37,12 +86,12 @@ def hindsight_steps(key: Array, steps: Array, lengths: Array, *, source: Literal
 
     Args:
       key: random key.
-      steps: (B,) int32, index t of the transition in its episode, 0 <= t < length.
-      lengths: (B,) int32, number of transitions of the episode.
+      steps: (...) int32, index t of the transition in its episode, 0 <= t < length.
+      lengths: (...) int32, number of transitions of the episode.
       source: see the module's docstring.
 
     Returns:
-      (B,) int32 index of a state, 0 <= index <= length.
+      (...) int32 index of a state, 0 <= index <= length.
     """
     if source not in ("final", "future", "episode"):
         raise ValueError(f"source = {source!r} is not the transition's own episode: choose final, future or episode")
@@ -58,16 +107,16 @@ def intersection_steps(key: Array, steps: Array, lengths: Array, is_near: Array)
     Args:
       key: random key.
       steps, lengths: (B,) int32.
-      is_near: (B, T + 1) bool per state of the episode; what lies outside t + 1 .. length is not looked at.
+      is_near: (B, T) bool per transition of the episode, whether the state that it leads to lies near a goal; what is not later is not looked at.
 
     Returns:
-      (B,) int32 index of a state, and (B,) bool whether there is one; where there is none, the index is 0.
+      (B,) int32 index of a state, and (B,) bool whether there is one; where there is none, the index is 1.
     """
-    state = jnp.arange(is_near.shape[1])[None]
-    eligible = is_near & (state > steps[:, None]) & (state <= lengths[:, None])
+    transition = jnp.arange(is_near.shape[1])[None]
+    eligible = is_near & (transition >= steps[:, None]) & (transition < lengths[:, None])
     count = jnp.sum(eligible, axis=1)
     rank = uniform_index(key, steps.shape, jnp.maximum(count, 1)) + 1
-    return jnp.argmax(jnp.cumsum(eligible, axis=1) == rank[:, None], axis=1).astype(jnp.int32), count > 0
+    return jnp.argmax(jnp.cumsum(eligible, axis=1) == rank[:, None], axis=1).astype(jnp.int32) + 1, count > 0
 
 
 def choose_sources(key: Array, num_rows: int, weights: Sequence[Array | float]) -> Array:

@@ -15,36 +15,12 @@ from flax import struct
 
 from hindrl_jax.base.types import Array
 from hindrl_jax.config import AgentConfig
+from hindrl_jax.core.kernels import bfloat16_product
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 _KERNEL_INIT = nn.initializers.variance_scaling(1.0 / 3.0, "fan_in", "uniform")  # U(-b, b), b = 1 / sqrt(fan_in), as in the thesis's framework
 
 Params = Any
-
-
-@jax.custom_vjp
-def _bfloat16_product(kernel: Array, features: Array) -> Array:
-    """kernel^T features, (in, out) and (in, B) -> (out, B), from operands rounded to bfloat16, summed in float32, in both directions."""
-    return _bfloat16_forward(kernel, features)[0]
-
-
-def _dot(a: Array, b: Array, *, contract: tuple[int, int]) -> Array:
-    return jax.lax.dot_general(a, b, (((contract[0],), (contract[1],)), ((), ())), preferred_element_type=jnp.float32)
-
-
-def _bfloat16_forward(kernel: Array, features: Array) -> tuple[Array, tuple[Array, Array]]:
-    kernel, features = kernel.astype(jnp.bfloat16), features.astype(jnp.bfloat16)
-    # The barrier keeps the transposition out of the product, whose fast form on a CPU takes row-major operands.
-    return _dot(jax.lax.optimization_barrier(kernel.T), features, contract=(1, 0)), (kernel, features)
-
-
-def _bfloat16_backward(residuals: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
-    kernel, features = residuals
-    cotangent = cotangent.astype(jnp.bfloat16)
-    return _dot(features, cotangent, contract=(1, 1)), _dot(kernel, cotangent, contract=(1, 0))
-
-
-_bfloat16_product.defvjp(_bfloat16_forward, _bfloat16_backward)
 
 
 class Dense(nn.Module):
@@ -57,7 +33,7 @@ class Dense(nn.Module):
     def __call__(self, features: Array) -> Array:
         kernel = self.param("kernel", _KERNEL_INIT, (features.shape[0], self.width))
         bias = self.param("bias", nn.initializers.zeros, (self.width,))
-        product = _bfloat16_product(kernel, features) if self.bfloat16 else kernel.T @ features
+        product = bfloat16_product(kernel, features) if self.bfloat16 else kernel.T @ features
         return product + bias[:, None]
 
 
@@ -117,7 +93,7 @@ def init_actor(key: Array, config: AgentConfig, *, input_dim: int, action_dim: i
 
 
 def init_critics(key: Array, config: AgentConfig, *, input_dim: int, action_dim: int) -> Params:
-    """Parameters of the N critics, stacked along the leading axis of every leaf."""
+    """Parameters of the C critics, stacked along the leading axis of every leaf."""
     keys = jax.random.split(key, config.num_critics)
     return jax.vmap(lambda key: _critic(config, config.critic_outputs).init(key, jnp.zeros((input_dim + action_dim, 1))))(keys)
 
@@ -139,9 +115,9 @@ def _apply_each(params: Params, inputs: Array, action: Array, config: AgentConfi
 
 
 def apply_critics(params: Params, inputs: Array, action: Array, config: AgentConfig) -> Array:
-    """Quantiles of the return at inputs (input_dim, B) and actions (A, B): (N, Q, B); for algorithms without quantiles Q is 1.
+    """Quantiles of the return at inputs (input_dim, B) and actions (A, B): (C, Q, B); for algorithms without quantiles Q is 1.
 
-    N is that of the parameters, which may be a subset of the critics.
+    C is that of the parameters, which may be a subset of the critics.
     """
     return _apply_each(params, inputs, action, config, config.critic_outputs)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ class RolloutState(struct.PyTreeNode, kw_only=True):
     env_state: Any  # leaves (E, ...)
     observation: Array  # (E, D)
     desired_goal: Array  # (E, G), the behavioural goals
-    judged_by_goal: Array  # (E,) bool, whether the episode is to be rewarded for reaching that goal rather than by the environment
+    notes: dict[str, Array]  # leaves (E,), what the replay is to note of each transition of the episode, by name; most runs note nothing
 
 
 class StartTable(struct.PyTreeNode, kw_only=True):
@@ -51,42 +51,41 @@ def sample_starts(key: Array, table: StartTable, num_starts: int, *, share: Arra
     return table.states[demo, table.lengths[demo] - steps_left]
 
 
-def reset(
-    key: Array,
-    env: Environment,
-    behavioural_goals: GoalTable,
-    num_envs: int,
-    *,
-    starts: StartTable | None = None,
-    demo_reset_ratio: float = 0.0,
-    demo_reset_share: Array | float = 1.0,
-) -> RolloutState:
+class DemoResets(NamedTuple):
+    """That some episodes begin in demonstrated states instead of the environment's own."""
+
+    starts: StartTable
+    ratio: float
+    """The probability with which one does."""
+    share: Array | float
+    """The share of each demonstration, up to its end, that its states are drawn from."""
+
+
+def reset(key: Array, env: Environment, behavioural_goals: GoalTable, num_envs: int, demo_resets: DemoResets | None = None) -> RolloutState:
     """Starts `num_envs` episodes, each with a goal drawn from the table (thesis algorithm 5).
 
     Args:
       key: random key.
-      env: static; a `RestorableEnvironment` if there are `starts`.
+      env: static; a `RestorableEnvironment` if there are `demo_resets`.
       behavioural_goals: the table.
       num_envs: E.
-      starts: with probability `demo_reset_ratio` an episode begins in one of these states instead of the environment's own.
-      demo_reset_ratio: that probability.
-      demo_reset_share: the share of each demonstration, up to its end, that they are drawn from.
+      demo_resets: whether and where some episodes begin in demonstrated states.
     """
     key_env, key_goal = jax.random.split(key)
     env_state, observation = jax.vmap(env.reset)(jax.random.split(key_env, num_envs))
-    if starts is not None:
+    if demo_resets is not None:
         restorable = cast(RestorableEnvironment, env)
         key_choice, key_start, key_states = jax.random.split(jax.random.fold_in(key, 2), 3)  # 2: split has used what 0 and 1 give
-        vectors = sample_starts(key_start, starts, num_envs, share=demo_reset_share)
+        vectors = sample_starts(key_start, demo_resets.starts, num_envs, share=demo_resets.share)
         demonstrated = jax.vmap(restorable.vector_to_state)(jax.random.split(key_states, num_envs), vectors)
-        chosen = jax.random.bernoulli(key_choice, demo_reset_ratio, (num_envs,))
+        chosen = jax.random.bernoulli(key_choice, demo_resets.ratio, (num_envs,))
         env_state = tree_where(chosen, demonstrated, env_state)
         observation = jax.vmap(restorable.observe)(env_state)
     return RolloutState(
         env_state=env_state,
         observation=observation,
         desired_goal=sample_goals(key_goal, behavioural_goals, num_envs),
-        judged_by_goal=jnp.zeros(num_envs, bool),
+        notes={},
     )
 
 

@@ -62,13 +62,13 @@ BASELINE = Lever("default", "baseline", "the default recipe, without a second li
 
 LEVERS: tuple[Lever, ...] = (
     Lever("sac", "algorithm", "SAC in place of TQC", (("agent.base", "sac"),)),
-    Lever("td3", "algorithm", "TD3 in place of TQC, with its delayed actor", (("agent.base", "td3"), ("agent.actor_delay", 2))),
+    Lever("td3", "algorithm", "TD3 in place of TQC, with its delayed actor", (("agent.base", "td3"),)),
     Lever("ddpg", "algorithm", "DDPG in place of TQC, as DDPGfD and the HinDRL paper have it", (("agent.base", "ddpg"), ("agent.num_critics", 1))),
     Lever(
         "td3-preactivation",
         "algorithm",
         "as td3, with the mode before tanh kept small by a weight of 0.003 (HER)",
-        (("agent.base", "td3"), ("agent.actor_delay", 2), ("agent.preactivation_weight", 0.003)),
+        (("agent.base", "td3"), ("agent.preactivation_weight", 0.003)),
     ),
     Lever(
         "ddpg-preactivation",
@@ -98,15 +98,17 @@ LEVERS: tuple[Lever, ...] = (
         "relabelled with demonstrated goals that the rollout came near (HinDRL)",
         (("batch.hindrl_sampling_strategy", "joint_intersection"), ("batch.intersection_goals", "demonstrations")),
     ),
-    Lever("no-relabelling", "hindsight", "no relabelled rows (the thesis's TQCfD)", (("algo", "tqcfd"), ("batch.num_sampled_goals", 0.0))),
-    Lever("relabelled-4", "hindsight", "four relabelled rows for each original one, in place of 1/4 (thesis)", (("batch.num_sampled_goals", 4.0),)),
+    Lever("no-relabelling", "hindsight", "no relabelled rows (the thesis's TQCfD)", (("algo", "tqcfd"), ("batch.relabelled_per_original", 0.0))),
+    Lever(
+        "relabelled-4", "hindsight", "four relabelled rows for each original one, in place of 1/4 (thesis)", (("batch.relabelled_per_original", 4.0),)
+    ),
     Lever(
         "relabelled-go-on",
         "hindsight",
         "reaching a relabelled goal does not end the return (thesis)",
-        (("batch.terminate_on_relabel", False),),
+        (("quirks.bootstrap_past_relabelled_goals", True),),
     ),
-    Lever("strict-goal-test", "goals", "a goal is reached at distance < epsilon, not <= (thesis)", (("batch.inclusive_goal_test", False),)),
+    Lever("strict-goal-test", "goals", "a goal is reached at distance < epsilon, not <= (thesis)", (("quirks.strict_goal_test", True),)),
     Lever("task-goal", "goals", "rollouts aim at the task's constant goal, not at the end of a demonstration", (("goal.behavioural_goals", "task"),)),
     Lever(
         "smooth",
@@ -134,9 +136,8 @@ LEVERS: tuple[Lever, ...] = (
         "timeouts-terminal",
         "targets",
         "episodes cut by the horizon count as terminated (original code)",
-        (("batch.timeouts_are_terminal", True),),
+        (("quirks.timeouts_are_terminal", True),),
     ),
-    Lever("demo-monte-carlo", "targets", "demonstration rows have their whole return (DDPGfD)", (("batch.demo_returns", "monte_carlo"),)),
     Lever("demo-rows-none", "demonstrations", "no demonstration rows in the batch, so no cloning either", (("batch.max_demo_ratio", 0.0),)),
     Lever("demo-rows-half", "demonstrations", "half of the batch are demonstration rows, not a quarter (RLPD)", (("batch.max_demo_ratio", 0.5),)),
     Lever(
@@ -155,12 +156,10 @@ LEVERS: tuple[Lever, ...] = (
         "as bc-0.1, where the critics prefer the demonstrated action (Nair et al.)",
         (("agent.q_filter", True), ("agent.bc_weight", 0.1)),
     ),
-    Lever("value-normalised", "demonstrations", "value in the actor's loss over its mean size (TD3+BC)", (("agent.normalise_value", True),)),
     Lever("value-relative", "demonstrations", "value in the actor's loss over its own size, row by row", (("agent.relative_value", True),)),
     Lever("bc-warm-start", "demonstrations", "500 gradient steps of cloning before the first of reinforcement learning", (("bc_warm_start", 500),)),
-    Lever("pretraining", "demonstrations", "500 gradient steps on demonstrations alone at first (DQfD, DDPGfD)", (("pretrain_updates", 500),)),
-    Lever("bc-norm", "demonstrations", "cloning loss is the distance, not its square (original code)", (("agent.bc_loss", "norm"),)),
-    Lever("bc-sample", "demonstrations", "cloning loss of a sampled action, not of the mean one (original code)", (("agent.bc_action", "sample"),)),
+    Lever("bc-norm", "demonstrations", "cloning loss is the distance, not its square (original code)", (("quirks.bc_loss", "norm"),)),
+    Lever("bc-sample", "demonstrations", "cloning loss of a sampled action, not of the mean one (original code)", (("quirks.bc_action", "sample"),)),
     Lever(
         "demo-resets-0.25",
         "demonstrations",
@@ -180,8 +179,6 @@ LEVERS: tuple[Lever, ...] = (
     Lever("redq", "critic", "5 critics, of which 2 at random make the targets (REDQ)", (("agent.num_critics", 5), ("agent.num_target_critics", 2))),
     Lever("no-truncation", "critic", "no quantiles dropped from the targets", (("agent.top_quantiles_to_drop_per_net", 0),)),
     Lever("target-rate-0.005", "critic", "target critics follow at 0.005 in place of 0.02 (TQC)", (("agent.target_update_rate", 0.005),)),
-    Lever("gradients-clipped", "critic", "gradients of actor and critics no longer than 1", (("agent.max_gradient_norm", 1.0),)),
-    Lever("actor-delayed", "actor", "one gradient step of the actor for two of the critics (TD3)", (("agent.actor_delay", 2),)),
     Lever(
         "preactivation",
         "actor",
@@ -205,7 +202,7 @@ LEVERS: tuple[Lever, ...] = (
         "prioritised",
         "replay",
         "rows drawn by their errors, those of demonstrations with a bonus, which leaves few of them (prioritised replay; DDPGfD)",
-        (("batch.priority_exponent", 0.6), ("batch.demo_priority_bonus", 1.0)),
+        (("priority.priority_exponent", 0.6), ("priority.demo_priority_bonus", 1.0)),
     ),
     Lever("batch-1024", "replay", "batches of 1,024 rows in place of 256", (("batch.batch_size", 1_024),)),
     Lever("random-truncation-0.02", "rollout", "training episodes are cut off after a step with probability 0.02", (("random_truncation", 0.02),)),

@@ -20,8 +20,9 @@ from hindrl_jax.base.files import DAMAGED_ARCHIVE, disk_trouble, read_arrays
 from hindrl_jax.base.types import Episodes
 from hindrl_jax.core import rollout
 from hindrl_jax.core import train as training
-from hindrl_jax.core.agent import InputScale
+from hindrl_jax.core.agent import Policy
 from hindrl_jax.core.goals import GoalTable, sample_goals
+from hindrl_jax.core.inputs import InputScale
 from hindrl_jax.plotting.films import check_film, save_film, save_pictures
 from hindrl_jax.runs.spec import PARAMETERS, RunSpec, read_spec
 from hindrl_jax.tasks.from_gymnasium import Simulators, is_gymnasium
@@ -40,11 +41,9 @@ class Run:
 
     path: Path
     spec: RunSpec
-    policies: Any
-    """Parameters of the policies, leaves (S, ...)."""
-    behavioural_goals: GoalTable
+    policies: Policy
     """Leaves (S, ...)."""
-    scale: InputScale
+    behavioural_goals: GoalTable
     """Leaves (S, ...)."""
 
     def in_backend(self, backend: str) -> Run:
@@ -91,11 +90,11 @@ class Run:
         env, config = self.spec.env, self.spec.config
 
         @jax.vmap
-        def play_episodes(key: jax.Array, actor: Any, goals: GoalTable, scale: InputScale) -> rollout.Evaluation:
-            return rollout.evaluate(key, env, goals, training.make_policy(actor, scale, env, config, stochastic=stochastic), episodes)
+        def play_episodes(key: jax.Array, policy: Policy, goals: GoalTable) -> rollout.Evaluation:
+            return rollout.evaluate(key, env, goals, training.make_policy(policy, env, config, stochastic=stochastic), episodes)
 
         program = jax.jit(play_episodes, compiler_options=compiler_options(env))
-        return jax.device_get(program(keys, self.policies, self.behavioural_goals, self.scale))
+        return jax.device_get(program(keys, self.policies, self.behavioural_goals))
 
     def _play_in_gymnasium(self, keys: jax.Array, episodes: int, *, stochastic: bool) -> rollout.Evaluation:
         """Episodes of all seeds side by side, up to `num_envs` for each; leaves (S, episodes)."""
@@ -103,7 +102,7 @@ class Run:
         env: Any = self.spec.env
         policies = host.Policies(env, self.spec.config, seed_mesh(num_seeds), stochastic=stochastic)
         with contextlib.closing(Simulators(env, num_seeds * min(self.spec.config.num_envs, episodes))) as simulators:
-            return host.evaluate(keys, simulators, policies, self.policies, self.scale, episodes)
+            return host.evaluate(keys, simulators, policies, self.policies, episodes)
 
     def _play_one_by_one(self, keys: jax.Array, episodes: int, *, stochastic: bool, report: Callable[[int], None]) -> rollout.Evaluation:
         """One episode after the other; leaves (S, episodes)."""
@@ -120,8 +119,8 @@ class Run:
     def _act(self, index: int, *, stochastic: bool, any_goal: bool) -> Callable[[jax.Array, Any, jax.Array], jax.Array]:
         """The policy of one seed, for `player`. It aims at the first behavioural goal, or with `any_goal` at one drawn for the episode."""
         env = self.spec.env
-        actor, goals, scale = jax.tree.map(lambda leaf: leaf[index], (self.policies, self.behavioural_goals, self.scale))
-        policy = training.make_policy(actor, scale, env, self.spec.config, stochastic=stochastic)
+        policy_of_seed, goals = jax.tree.map(lambda leaf: leaf[index], (self.policies, self.behavioural_goals))
+        policy = training.make_policy(policy_of_seed, env, self.spec.config, stochastic=stochastic)
 
         def act(key: jax.Array, state: Any, observation: jax.Array) -> jax.Array:
             # The state's key is constant within an episode, and so is the goal drawn with it.
@@ -156,12 +155,12 @@ class Run:
     def _film(self, path: Path, index: int, keys: jax.Array, *, stochastic: bool) -> int:
         """`render` of an environment of Gymnasium, which draws itself."""
         env: Any = self.spec.env
-        actor, scale = jax.tree.map(lambda leaf: leaf[index : index + 1], (self.policies, self.scale))
+        policy_of_seed = jax.tree.map(lambda leaf: leaf[index : index + 1], self.policies)
         policies = host.Policies(env, self.spec.config, seed_mesh(1), stochastic=stochastic)
         pictures, num_solved = [], 0
         for key in keys:
             key_seed, key_act = jax.random.split(key)
-            episode, solved = host.film(env, int(jax.random.bits(key_seed)), policies.acting(key_act[None], actor, scale))
+            episode, solved = host.film(env, int(jax.random.bits(key_seed)), policies.acting(key_act[None], policy_of_seed))
             pictures += episode
             num_solved += solved
         with disk_trouble(path):
@@ -229,10 +228,10 @@ def load_run(path: str | os.PathLike[str]) -> Run:
         tree = unflatten_dict({name: jnp.asarray(array) for name, array in read_arrays(file).items()}, sep="/")
         goals = GoalTable(goals=tree["behavioural_goals"]["goals"], count=tree["behavioural_goals"]["count"])
         scale = _input_scale(tree["input_scale"])
-        policies = tree["policy"]
+        policies = Policy(actor=tree["policy"], scale=scale)
     except DAMAGED_ARCHIVE as error:
         raise UserError(f"{file} is damaged ({one_line(error)}): train again") from error
-    return Run(path=path, spec=spec, policies=policies, behavioural_goals=goals, scale=scale)
+    return Run(path=path, spec=spec, policies=policies, behavioural_goals=goals)
 
 
 def _input_scale(saved: dict[str, jax.Array]) -> InputScale:

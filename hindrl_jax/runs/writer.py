@@ -199,7 +199,7 @@ def peak_memory_bytes() -> int:
 
 
 def _save_parameters(path: Path, result: Result) -> None:
-    agent, goals, scale = result.state.agent, result.guidance.behavioural_goals, result.guidance.scale
+    agent, goals, scale = result.state.agent, result.guidance.behavioural_goals, result.state.agent.scale
     tree = {
         "policy": agent.average_actor,
         "actor": agent.actor,

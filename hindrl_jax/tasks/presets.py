@@ -15,7 +15,7 @@ from typing import Any, Literal, get_args
 
 from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.errors import UserError
-from hindrl_jax.config import AgentConfig, Algorithm, BatchConfig, GoalConfig, TrainConfig
+from hindrl_jax.config import AgentConfig, Algorithm, BatchConfig, GoalConfig, QuirksConfig, TrainConfig
 from hindrl_jax.tasks.registry import Family, did_you_mean, make, task
 
 Preset = Literal["default", "thesis", "original"]
@@ -54,7 +54,7 @@ def _as_algorithm(config: TrainConfig, algo: Algorithm) -> TrainConfig:
     """TQCfD is HinDRL without relabelling, Smooth HinDRL is HinDRL with the filter (thesis sections 4.1.3 and 4.1.4)."""
     batch, goal = config.batch, config.goal
     if algo == "tqcfd":
-        batch = dataclasses.replace(batch, num_sampled_goals=0.0)
+        batch = dataclasses.replace(batch, relabelled_per_original=0.0)
     if algo == "smooth-hindrl":
         goal = dataclasses.replace(goal, epsilon_filtering=True)
     return dataclasses.replace(config, algo=algo, batch=batch, goal=goal)
@@ -97,7 +97,7 @@ def _default(algo: Algorithm, family: Family) -> TrainConfig:
         eval_every=4_000,
         eval_episodes=20,
         batch=BatchConfig(n_step=10, gamma=0.99, bound_by_obtained_return=True),
-        goal=GoalConfig(m=5, k=0.0),
+        goal=GoalConfig(epsilon_steps=5),
         # -4, not -8: with less noise the mean action comes to rest at the edge of a waypoint (docs/recipe.md)
         agent=dataclasses.replace(_ARM_AGENT, target_update_rate=0.01, final_target_entropy=-4.0, input_encoding=encoding),
     )
@@ -112,8 +112,8 @@ def _retold() -> TrainConfig:
         learning_starts=4_800,
         demo_reset_ratio=0.5,
         eval_every=10_000,
-        batch=BatchConfig(n_step=3, max_demo_ratio=0.125, num_sampled_goals=4.0, hindrl_sampling_strategy="joint_union"),
-        goal=GoalConfig(m=5, behavioural_goals="task"),
+        batch=BatchConfig(n_step=3, max_demo_ratio=0.125, relabelled_per_original=4.0, hindrl_sampling_strategy="joint_union"),
+        goal=GoalConfig(epsilon_steps=5, behavioural_goals="task"),
         agent=dataclasses.replace(_ARM_AGENT, final_target_entropy=-8.0),
     )
 
@@ -121,7 +121,7 @@ def _retold() -> TrainConfig:
 def _gymnasium(algo: Algorithm, env: Any) -> TrainConfig:
     """The recipe for environments of Gymnasium: rollouts aim at the goal that an episode comes with, as the demonstrations did."""
     tolerance = env.goal_tolerance
-    epsilon: dict[str, Any] = dict(m=5) if tolerance is None else dict(epsilon=round(float(tolerance.min()), 4))
+    epsilon: dict[str, Any] = dict(epsilon_steps=5) if tolerance is None else dict(epsilon=round(float(tolerance.min()), 4))
     goal = GoalConfig(behavioural_goals="environment", **epsilon)
     if algo == "bc":
         config = _default("bc", "reach")
@@ -134,7 +134,7 @@ def _gymnasium(algo: Algorithm, env: Any) -> TrainConfig:
         eval_every=2_500,
         eval_episodes=50,
         goal=goal,
-        batch=BatchConfig(n_step=1, num_sampled_goals=1.0, hindrl_sampling_strategy="joint_union"),
+        batch=BatchConfig(n_step=1, relabelled_per_original=1.0, hindrl_sampling_strategy="joint_union"),
         agent=AgentConfig(
             net_arch=(256, 256),
             layer_norm=True,
@@ -147,7 +147,7 @@ def _gymnasium(algo: Algorithm, env: Any) -> TrainConfig:
     )
 
 
-_FRAMEWORK: dict[str, Any] = dict(input_encoding="raw", actor_average_rate=1.0, actor_average_span=0.0, policy_input="achieved_desired_observation")
+_FRAMEWORK: dict[str, Any] = dict(input_encoding="raw", actor_average_rate=1.0, actor_average_span=0.0)
 """How the networks of the thesis's framework are fed and evaluated."""
 
 
@@ -160,6 +160,7 @@ def _thesis(algo: Algorithm, family: Family) -> TrainConfig:
             eval_every=1_000,
             batch=BatchConfig(batch_size=2_048, n_step=1),
             agent=AgentConfig(net_arch=(32, 32), learning_rate=1e-3, **_FRAMEWORK),
+            quirks=QuirksConfig(achieved_goal_input=True),
         )
     reach = family == "reach"
     return TrainConfig(
@@ -173,13 +174,12 @@ def _thesis(algo: Algorithm, family: Family) -> TrainConfig:
             batch_size=12_000 if reach else 4_096,
             max_demo_ratio=0.1,
             reach_zero=1_000_000 if reach else 500_000,
-            num_sampled_goals=4.0,
+            relabelled_per_original=4.0,
             hindrl_sampling_strategy="task_conditioned",
             n_step=1,
             gamma=0.99,
-            terminate_on_relabel=False,
         ),
-        goal=GoalConfig(m=5 if reach else 0, k=0.0),
+        goal=GoalConfig(epsilon_steps=5 if reach else 0),
         agent=AgentConfig(
             net_arch=8 * (32,) if reach else 4 * (64,),  # for reach the appendix prints seven layers, the code has eight
             layer_norm=False,
@@ -193,20 +193,20 @@ def _thesis(algo: Algorithm, family: Family) -> TrainConfig:
             bc_weight=0.0 if reach else 1.0,
             **_FRAMEWORK,
         ),
+        quirks=QuirksConfig(achieved_goal_input=True, bootstrap_past_relabelled_goals=True),
     )
 
 
 def _original(algo: Algorithm, family: Family) -> TrainConfig:
     config = _thesis(algo, family)
-    return dataclasses.replace(
-        config,
-        batch=dataclasses.replace(config.batch, inclusive_goal_test=False, timeouts_are_terminal=True),
-        goal=dataclasses.replace(
-            config.goal,
-            behavioural_goals="task",
-            exclude_last_goal=True,
-            rescale_demo_actions=False,
-            misalign_demo_actions=family == "reach",
-        ),
-        agent=dataclasses.replace(config.agent, bc_loss="norm", bc_action="sample"),
+    quirks = dataclasses.replace(
+        config.quirks,
+        strict_goal_test=True,
+        timeouts_are_terminal=True,
+        exclude_last_goal=True,
+        unscaled_demo_actions=True,
+        misaligned_demo_actions=family == "reach",
     )
+    if algo != "bc":  # the code's own baseline compares the mean action, squared
+        quirks = dataclasses.replace(quirks, bc_loss="norm", bc_action="sample")
+    return dataclasses.replace(config, goal=dataclasses.replace(config.goal, behavioural_goals="task"), quirks=quirks)

@@ -18,13 +18,16 @@ from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Array, Episodes
 from hindrl_jax.config import SWEEPABLE, TrainConfig, sweepable_value, with_traced_values
 from hindrl_jax.core import train as training
-from hindrl_jax.core.agent import Metrics
+from hindrl_jax.core.agent import Metrics, policy
+from hindrl_jax.core.guidance import Guidance
+from hindrl_jax.core.guidance import guidance as guidance_of
 from hindrl_jax.core.rollout import Evaluation
-from hindrl_jax.core.train import Guidance, TrainState
+from hindrl_jax.core.train import TrainState
 from hindrl_jax.tasks.from_gymnasium import is_gymnasium
 from hindrl_jax.tasks.registry import task
 from hindrl_jax.training.devices import free_memory, gather, over_seeds, seed_mesh, shapes_on, spread, tree_bytes
 from hindrl_jax.training.host import FRESH_EPISODES, HostPrograms, record_gymnasium
+from hindrl_jax.training.prioritised import sampler_for
 from hindrl_jax.training.recording import on_host, record
 
 SOLVED = 0.95
@@ -268,8 +271,8 @@ def fit(
     configs = _configs_per_seed(config, seeds)
     config = configs[0]
     check_config(env, config)
-    if config.goal.misalign_demo_actions and int(tables.lengths.min()) < 2:
-        raise UserError("misalign_demo_actions needs demonstrations of at least 2 steps: turn it off or record others")
+    if config.quirks.misaligned_demo_actions and int(tables.lengths.min()) < 2:
+        raise UserError("misaligned_demo_actions needs demonstrations of at least 2 steps: turn it off or record others")
 
     if config.demo_reset_ratio == 0.0:
         tables = tables.replace(states=None)  # nobody needs them on the devices
@@ -292,7 +295,7 @@ def fit(
         result.env_steps = programs.steps_at_random
         if programs.pretrain is not None:
             result.state = jax.block_until_ready(programs.pretrain(result.state, result.guidance, values))
-            result.updates = config.bc_warm_start + config.pretrain_updates
+            result.updates = config.bc_warm_start
     while result.steps_done < config.steps:
         result.state, metrics = programs.learn(result.state, result.guidance, values)
         result.chunks.append(gather(metrics))
@@ -304,7 +307,7 @@ def fit(
         _check_finite(result)
         evaluations_done = len(result.rows) // len(seeds)
         if result.steps_done >= min(programs.steps_at_random + (evaluations_done + 1) * config.eval_every, config.steps):
-            result.key, evaluation = programs.evaluate(result.key, result.state.agent.average_actor, result.guidance, values)
+            result.key, evaluation = programs.evaluate(result.key, policy(result.state.agent, average=True), result.guidance, values)
             evaluation = gather(evaluation)
             result.train_seconds = time.perf_counter() - started
             averaged = {name: np.mean([chunk[name] for chunk in result.chunks], axis=0) for name in result.chunks[0]}
@@ -313,7 +316,7 @@ def fit(
         result.train_seconds = time.perf_counter() - started
         report(result)
 
-    _, fresh = programs.evaluate_fresh(result.key, result.state.agent.average_actor, result.guidance, values)
+    _, fresh = programs.evaluate_fresh(result.key, policy(result.state.agent, average=True), result.guidance, values)
     fresh = gather(fresh)
     result.final_success, result.final_length = fresh.success.mean(axis=1), fresh.length.mean(axis=1)
     if jax.process_count() > 1:
@@ -340,7 +343,7 @@ def _check_finite(result: Result) -> None:
             index = int(np.argmin(np.isfinite(values)))
             raise Diverged(
                 f"{name} of seed {result.seeds[index]} is {values[index]} after {result.env_steps} environment steps and {result.updates} updates: "
-                "try a lower learning_rate, max_gradient_norm = 1, or layer_norm"
+                "try a lower learning_rate, or layer_norm"
             )
 
 
@@ -420,18 +423,22 @@ class _Programs:
         def start(seed: Array, demonstrations: Episodes, values: dict[str, Array]) -> tuple[Guidance, TrainState, Array]:
             actual = with_traced_values(config, values)
             key_init, key_evaluate = jax.random.split(jax.random.key(seed))
-            guidance = training.guidance(demonstrations, env, actual)
-            return guidance, training.init(key_init, guidance, env, actual), key_evaluate
+            guidance = guidance_of(demonstrations, env, actual)
+            return guidance, training.init(key_init, guidance, env, actual, sampler=sampler_for(env, actual)), key_evaluate
 
         def collect(state: TrainState, guidance: Guidance, values: dict[str, Array]) -> TrainState:
-            return training.collect(state, guidance, env=env, config=with_traced_values(config, values), num_iterations=self.warm_up)
+            actual = with_traced_values(config, values)
+            return training.collect(state, guidance, env=env, config=actual, num_iterations=self.warm_up, sampler=sampler_for(env, actual))
 
         def pretrain(state: TrainState, guidance: Guidance, values: dict[str, Array]) -> TrainState:
-            return training.pretrain(state, guidance, env=env, config=with_traced_values(config, values))
+            actual = with_traced_values(config, values)
+            return training.clone(state, guidance, env=env, config=actual, num_iterations=config.bc_warm_start)[0]
 
         def learn(state: TrainState, guidance: Guidance, values: dict[str, Array]) -> tuple[TrainState, Metrics]:
-            iterate = training.clone if cloning else training.learn
-            return iterate(state, guidance, env=env, config=with_traced_values(config, values), num_iterations=self.chunk)
+            actual = with_traced_values(config, values)
+            if cloning:
+                return training.clone(state, guidance, env=env, config=actual, num_iterations=self.chunk)
+            return training.learn(state, guidance, env=env, config=actual, num_iterations=self.chunk, sampler=sampler_for(env, actual))
 
         def evaluate(key: Array, actor: Any, guidance: Guidance, values: dict[str, Array], *, num_episodes: int) -> tuple[Array, Evaluation]:
             key, key_play = jax.random.split(key)
@@ -450,7 +457,7 @@ class _Programs:
             guidance, state, key = shapes_on(traced.out_info, self.mesh)
             self.shapes = {"guidance": guidance, "state": state, "key": key}
             _check_fits_into_memory(state, len(configs), self.mesh)
-            actor = state.agent.average_actor
+            actor = policy(state.agent, average=True)
             learning = compiled(program(learn, donate=True).trace(state, guidance, values))
             starting = compiled(traced, _RUN_ONCE)
             evaluating = {
@@ -458,7 +465,7 @@ class _Programs:
                 for num_episodes in {config.eval_episodes, FRESH_EPISODES}
             }
             collecting = None if cloning else compiled(program(collect, donate=True).trace(state, guidance, values), _RUN_ONCE)
-            pretrains = not cloning and config.bc_warm_start + config.pretrain_updates > 0
+            pretrains = not cloning and config.bc_warm_start > 0
             pretraining = compiled(program(pretrain, donate=True).trace(state, guidance, values)) if pretrains else None
         self.start, self.learn, self.collect = starting.result(), learning.result(), collecting.result() if collecting else None
         self.pretrain = pretraining.result() if pretraining else None

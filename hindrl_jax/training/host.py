@@ -25,17 +25,20 @@ from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Array, Episodes, TimeStep
 from hindrl_jax.config import TrainConfig, with_traced_values
 from hindrl_jax.core import train as training
-from hindrl_jax.core.agent import InputScale, Metrics
+from hindrl_jax.core.agent import Metrics, Policy, policy
+from hindrl_jax.core.guidance import Guidance
+from hindrl_jax.core.guidance import guidance as guidance_of
 from hindrl_jax.core.rollout import Evaluation, RolloutState
-from hindrl_jax.core.train import Guidance, TrainState
+from hindrl_jax.core.train import TrainState
 from hindrl_jax.tasks.from_gymnasium import GymnasiumEnv, Outcome, Simulators
 from hindrl_jax.training.devices import by_seed, over_seeds, seed_mesh, shapes_on
+from hindrl_jax.training.prioritised import sampler_for
 
 FRESH_EPISODES = 100
 """By which a finished run is judged."""
 Act = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """(observations (N, D), desired goals (N, G)) -> actions (N, A) in the environment's own units."""
-Policy = Callable[[dict[str, np.ndarray], np.random.Generator], np.ndarray]
+Demonstrator = Callable[[dict[str, np.ndarray], np.random.Generator], np.ndarray]
 """(an observation as Gymnasium's environment gives it, randomness) -> action (A,) in the environment's own units."""
 
 
@@ -95,12 +98,13 @@ class HostPrograms:
         def start(seed: Array, demonstrations: Episodes, begun: RolloutState, values: dict[str, Array]) -> tuple[Guidance, TrainState, Array]:
             actual = with_traced_values(config, values)
             key_init, key_evaluate = jax.random.split(jax.random.key(seed))
-            guidance = training.guidance(demonstrations, env, actual)
-            return guidance, training.init(key_init, guidance, env, actual, begun=begun), key_evaluate
+            guidance = guidance_of(demonstrations, env, actual)
+            state = training.init(key_init, guidance, env, actual, sampler=sampler_for(env, actual), begun=begun)
+            return guidance, state, key_evaluate
 
-        def decide(key: Array, actor: Any, rollout: RolloutState, scale: InputScale, *, at_random: bool) -> tuple[Array, Plan]:
+        def decide(key: Array, explorer: Policy, rollout: RolloutState, *, at_random: bool) -> tuple[Array, Plan]:
             key, key_act, key_goals, key_nearby, key_batch, key_updates = jax.random.split(key, 6)
-            act = training.act_at_random(env) if at_random else training.make_policy(actor, scale, env, config, stochastic=True)
+            act = training.act_at_random(env) if at_random else training.make_policy(explorer, env, config, stochastic=True)
             action = act(key_act, rollout.observation, rollout.desired_goal)
             keys = dict(key_goals=key_goals, key_nearby=key_nearby, key_batch=key_batch, key_updates=key_updates)
             return key, Plan(action=action, env_action=action_to_env(action, env), **keys)
@@ -110,15 +114,22 @@ class HostPrograms:
         ) -> TrainState:
             ended, before = time_step.terminated | time_step.truncated, state.rollout
             goal = jnp.where(ended[:, None], begun.desired_goal, before.desired_goal)  # within an episode it may be one that was chosen here
-            after = begun.replace(desired_goal=goal, judged_by_goal=before.judged_by_goal & ~ended)
+            after = begun.replace(desired_goal=goal, notes={name: noted & ~ended for name, noted in before.notes.items()})
             actual = with_traced_values(config, values)
-            return training.remember(plan.key_goals, plan.key_nearby, state, plan.action, time_step, after, guidance, env, actual)
+            recorded = training.record(plan.key_nearby, state, (plan.action, time_step), guidance, env, actual)
+            kept = sampler_for(env, actual).record(state.sampler, state.replay, recorded.replay)
+            return training.continue_from(plan.key_goals, recorded.replace(sampler=kept), after, time_step, env, actual)
 
         def improve(state: TrainState, plan: Plan, guidance: Guidance, values: dict[str, Array]) -> tuple[TrainState, Metrics]:
-            return training.improve(plan.key_batch, plan.key_updates, state, guidance, env, with_traced_values(config, values))
+            actual = with_traced_values(config, values)
+            sampler = sampler_for(env, actual)
+            batches, drawn = sampler.draw(plan.key_batch, state, guidance)
+            state, metrics = training.gradient_steps(plan.key_updates, state, batches, env, actual)
+            return state.replace(sampler=sampler.learned(state, batches, drawn)), metrics
 
         def pretrain(state: TrainState, guidance: Guidance, values: dict[str, Array]) -> TrainState:
-            return training.pretrain(state, guidance, env=env, config=with_traced_values(config, values))
+            actual = with_traced_values(config, values)
+            return training.clone(state, guidance, env=env, config=actual, num_iterations=config.bc_warm_start)[0]
 
         def clone(state: TrainState, guidance: Guidance, values: dict[str, Array]) -> tuple[TrainState, Metrics]:
             return training.clone(state, guidance, env=env, config=with_traced_values(config, values), num_iterations=chunk)
@@ -139,7 +150,7 @@ class HostPrograms:
             if cloning:
                 programs = {"clone": compiled(clone, state, guidance, values, donate=True)[0]}
             else:
-                planning = (state.key, state.agent.actor, state.rollout, guidance.scale)
+                planning = (state.key, policy(state.agent, average=False), state.rollout)
                 deciding, (_, plan) = compiled(functools.partial(decide, at_random=False), *planning)
                 flags = jax.ShapeDtypeStruct(self._shape, bool)
                 step = TimeStep(
@@ -151,7 +162,7 @@ class HostPrograms:
                     "decide": deciding,
                     "decide_at_random": compiled(functools.partial(decide, at_random=True), *planning)[0],
                 }
-                if config.bc_warm_start + config.pretrain_updates > 0:
+                if config.bc_warm_start > 0:
                     programs["pretrain"] = compiled(pretrain, state, guidance, values, donate=True)[0]
             self._start = starting.result()
             self._programs = {name: program.result() for name, program in programs.items()}
@@ -196,10 +207,10 @@ class HostPrograms:
 
     def _evaluated(self, key: Array, actor: Any, guidance: Guidance, num_episodes: int) -> tuple[Array, Evaluation]:
         both = jax.vmap(jax.random.split)(key)
-        return both[:, 0], evaluate(both[:, 1], self._fresh, self._act, actor, guidance.scale, num_episodes)
+        return both[:, 0], evaluate(both[:, 1], self._fresh, self._act, actor, num_episodes)
 
     def _planned(self, state: TrainState, guidance: Guidance, *, at_random: bool) -> tuple[TrainState, Plan]:
-        key, plan = self._programs["decide_at_random" if at_random else "decide"](state.key, state.agent.actor, state.rollout, guidance.scale)
+        key, plan = self._programs["decide_at_random" if at_random else "decide"](state.key, policy(state.agent, average=False), state.rollout)
         return state.replace(key=key), plan
 
     def _live(self, state: TrainState, plan: Plan, guidance: Guidance, values: dict[str, Array]) -> TrainState:
@@ -234,46 +245,46 @@ class HostPrograms:
 
 
 def _episodes(observation: np.ndarray, desired_goal: np.ndarray) -> RolloutState:
-    return RolloutState(env_state=(), observation=observation, desired_goal=desired_goal, judged_by_goal=np.zeros(observation.shape[:2], bool))
+    return RolloutState(env_state=(), observation=observation, desired_goal=desired_goal, notes={})
 
 
 class Policies:
     """The policies of S seeds as one compiled program, for any number of environments each."""
 
     def __init__(self, env: GymnasiumEnv, config: TrainConfig, mesh: Mesh, *, stochastic: bool):
-        def act(key: Array, actor: Any, scale: InputScale, observation: Array, desired_goal: Array) -> tuple[Array, Array]:
+        def act(key: Array, actor: Policy, observation: Array, desired_goal: Array) -> tuple[Array, Array]:
             key, key_act = jax.random.split(key)
-            action = training.make_policy(actor, scale, env, config, stochastic=stochastic)(key_act, observation, desired_goal)
+            action = training.make_policy(actor, env, config, stochastic=stochastic)(key_act, observation, desired_goal)
             return key, action_to_env(action, env)
 
         self._mesh, self._program = mesh, jax.jit(over_seeds(act, mesh))
 
-    def acting(self, key: Array, actor: Any, scale: InputScale) -> Act:
+    def acting(self, key: Array, actor: Policy) -> Act:
         """A function of what all environments observe, those of the first seed first; it draws from the keys (S,)."""
 
         def act(observation: np.ndarray, desired_goal: np.ndarray) -> np.ndarray:
             nonlocal key
             inputs = jax.device_put([array.reshape(len(key), -1, array.shape[1]) for array in (observation, desired_goal)], by_seed(self._mesh))
-            key, action = self._program(key, actor, scale, *inputs)
+            key, action = self._program(key, actor, *inputs)
             return np.asarray(action).reshape(len(observation), -1)
 
         return act
 
 
-def evaluate(key: Array, simulators: Simulators, policies: Policies, actor: Any, scale: InputScale, num_episodes: int) -> Evaluation:
+def evaluate(key: Array, simulators: Simulators, policies: Policies, actor: Policy, num_episodes: int) -> Evaluation:
     """Plays fresh episodes with each seed's policy, numpy leaves (S, num_episodes).
 
     Args:
       key: (S,) keys; equal ones give equal episodes.
       simulators: as many environments for each seed.
       policies: what acts.
-      actor, scale: leaves (S, ...).
+      actor: leaves (S, ...).
       num_episodes: for each seed; shared out evenly between its environments, whatever their lengths.
     """
     key_seeds, key_act = (jax.vmap(jax.random.fold_in, (0, None))(key, index) for index in (0, 1))
     num_envs = simulators.num_envs // len(key)
     seeds = np.asarray(jax.vmap(lambda key: jax.random.bits(key, (num_envs,)))(key_seeds))
-    success, length = play(simulators, seeds.reshape(-1), policies.acting(key_act, actor, scale), -(-num_episodes // num_envs))
+    success, length = play(simulators, seeds.reshape(-1), policies.acting(key_act, actor), -(-num_episodes // num_envs))
     # Episode n of a seed is the (n // E)-th of its environment n % E.
     ordered = (array.reshape(len(key), num_envs, -1).swapaxes(1, 2).reshape(len(key), -1)[:, :num_episodes] for array in (success, length))
     return Evaluation(success=next(ordered), length=next(ordered))
@@ -325,7 +336,7 @@ def film(env: GymnasiumEnv, seed: int, act: Act) -> tuple[list[np.ndarray], bool
         simulators.close()
 
 
-def record_gymnasium(env: GymnasiumEnv, policy: Policy, num_demos: int, *, seed: int = 0, max_attempts: int | None = None) -> Episodes:
+def record_gymnasium(env: GymnasiumEnv, policy: Demonstrator, num_demos: int, *, seed: int = 0, max_attempts: int | None = None) -> Episodes:
     """Records demonstrations that reach their goals, each cut where it does; others are discarded.
 
     Args:

@@ -299,7 +299,7 @@ def test_existing_run_is_refused_and_kept(run, capsys):
         (["train", "--steps", "100"], "steps = 100"),
         (["train", "--buffer-size", "200"], "buffer_size = 200"),
         (["train", "--num-objects", "99"], "99"),
-        (["train", "--algo", "tqcfd", "--num-sampled-goals", "3"], "num_sampled_goals = 3"),
+        (["train", "--algo", "tqcfd", "--relabelled-per-original", "3"], "relabelled_per_original = 3"),
         (["train", "--config", "missing.json"], "missing.json"),
         (["train", "--config", "x", "--algo", "bc"], "exclude each other"),
         (["eval", "missing"], "missing"),
@@ -387,7 +387,7 @@ def test_every_config_field_is_a_flag(capsys):
 
 
 def test_flags_of_each_type():
-    arguments = ["--batch-size", "64", "--no-inclusive-goal-test", "--target-entropy", "-2.5", "--reach-zero", "None", "--num-objects", "3"]
+    arguments = ["--batch-size", "64", "--strict-goal-test", "--target-entropy", "-2.5", "--reach-zero", "None", "--num-objects", "3"]
     spec, _ = training.parse_train(arguments)
     assert (spec.config.batch.batch_size, spec.config.batch.inclusive_goal_test) == (64, False)
     assert (spec.config.agent.target_entropy, spec.config.batch.reach_zero, spec.env.num_objects) == (-2.5, None, 3)

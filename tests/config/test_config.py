@@ -66,7 +66,7 @@ BAD = [
     (BatchConfig, "batch_size", [0, 1.5, True, "512"]),
     (BatchConfig, "max_demo_ratio", [-0.1, 1.1, float("nan"), None, 1.0]),  # 1.0 leaves no replay row
     (BatchConfig, "reach_zero", [0, -5, 0.5]),
-    (BatchConfig, "num_sampled_goals", [-1, "4", float("inf")]),
+    (BatchConfig, "relabelled_per_original", [-1, "4", float("inf")]),
     (BatchConfig, "hindrl_sampling_strategy", ["intersection", "Future", None, "mixture"]),
     (BatchConfig, "union_sampling_ratio", [-0.1, 1.5]),
     (BatchConfig, "intersection_goals", ["both"]),
@@ -167,7 +167,7 @@ def test_the_table_of_bad_values_is_complete():
 @pytest.mark.parametrize(
     "build",
     [
-        lambda: BatchConfig(max_demo_ratio=0, gamma=1, reach_zero=None, num_sampled_goals=0.5),  # an int serves as a float
+        lambda: BatchConfig(max_demo_ratio=0, gamma=1, reach_zero=None, relabelled_per_original=0.5),  # an int serves as a float
         lambda: AgentConfig(num_quantiles=25, top_quantiles_to_drop_per_net=24, target_entropy=-3.0, bc_weight=0, net_arch=(1,)),
         lambda: TrainConfig(algo="bc", steps=1, learning_starts=5),  # cloning takes no environment steps
         lambda: TrainConfig(demo_reset_ratio=1),
@@ -181,7 +181,11 @@ def test_values_at_the_edge_are_accepted(build):
 @pytest.mark.parametrize(
     ("fitting", "contradiction", "name"),
     [
-        (dict(algo="tqcfd", batch=BatchConfig(num_sampled_goals=0)), dict(batch=BatchConfig(num_sampled_goals=1)), "num_sampled_goals"),
+        (
+            dict(algo="tqcfd", batch=BatchConfig(relabelled_per_original=0)),
+            dict(batch=BatchConfig(relabelled_per_original=1)),
+            "relabelled_per_original",
+        ),
         (dict(algo="smooth-hindrl", goal=GoalConfig(epsilon_filtering=True)), dict(goal=GoalConfig()), "epsilon_filtering"),
     ],
 )
@@ -231,7 +235,7 @@ def test_conditions_are_about_fields_that_exist():
         ({"agent": {"base": "td3"}}, "exploration_noise", None),
         ({}, "union_sampling_ratio", "only relabelling by joint_union"),
         ({"batch": {"hindrl_sampling_strategy": "joint_union"}}, "union_sampling_ratio", None),
-        ({"batch": {"num_sampled_goals": 0.0}}, "hindrl_sampling_strategy", "nothing is relabelled"),
+        ({"batch": {"relabelled_per_original": 0.0}}, "hindrl_sampling_strategy", "nothing is relabelled"),
         ({"batch": {"max_demo_ratio": 0.0}}, "bc_loss", "no demonstration rows to clone"),
         ({"batch": {"max_demo_ratio": 0.0, "priority_exponent": 0.5}}, "bc_loss", None),
         ({"agent": {"bc_weight": 0.0}}, "bc_action", "nothing is cloned"),

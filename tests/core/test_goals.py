@@ -73,7 +73,7 @@ def test_epsilon_is_that_of_plain_loops_whatever_the_padding(m, k, padding):
     rng = np.random.default_rng(0)
     demonstrations = [rng.normal(size=(num, 2)) for num in (7, 2, 4, 6)]  # with m = 3, the second has no pair
     table, lengths = padded(demonstrations, horizon=8, padding=padding)
-    epsilon = epsilon_from_demonstrations(table, lengths, m=m, k=k)
+    epsilon = epsilon_from_demonstrations(table, lengths, steps=m, deviations=k)
     np.testing.assert_allclose(epsilon, epsilon_twin(demonstrations, m=m, k=k), atol=1e-6)
 
 
@@ -81,8 +81,8 @@ def test_epsilon_by_hand():
     # Pairs two steps apart: |3 - 0| = 3, |4 - 1| = 3 and, in the other demonstration, |0 - 9| = 9. Mean 5, deviation sqrt((4 + 4 + 16) / 3).
     demonstrations = [np.array([[0.0], [1.0], [3.0], [4.0]]), np.array([[9.0], [2.0], [0.0]])]
     table, lengths = padded(demonstrations, horizon=3, padding=-7.0)
-    np.testing.assert_allclose(epsilon_from_demonstrations(table, lengths, m=2, k=0.0), [5.0])
-    np.testing.assert_allclose(epsilon_from_demonstrations(table, lengths, m=2, k=2.0), [5.0 + 2.0 * 8.0**0.5], rtol=1e-6)
+    np.testing.assert_allclose(epsilon_from_demonstrations(table, lengths, steps=2, deviations=0.0), [5.0])
+    np.testing.assert_allclose(epsilon_from_demonstrations(table, lengths, steps=2, deviations=2.0), [5.0 + 2.0 * 8.0**0.5], rtol=1e-6)
 
 
 def filter_twin(goals, epsilon, *, inclusive):

@@ -205,7 +205,7 @@ def expected_return(state, length, goal, *, relabelled, config):
     return total, discount, following
 
 
-BATCH = BatchConfig(batch_size=64, max_demo_ratio=0.2, num_sampled_goals=3, gamma=0.5, n_step=2, bound_by_obtained_return=True)
+BATCH = BatchConfig(batch_size=64, max_demo_ratio=0.2, relabelled_per_original=3, gamma=0.5, n_step=2, bound_by_obtained_return=True)
 NUM_DEMO, NUM_RELABELLED = 12, 39  # int(0.2 * 64), (64 - 12) * 3 // 4
 STRATEGIES = {
     "final": {},
@@ -384,7 +384,7 @@ def test_transitions_are_drawn_by_their_priorities_wherever_the_rings_stand(step
     history, story = replay_history([[3], [3, 1, 2]])
     replay = with_random_priorities(at(history, step), step)
     priorities, sources = replay.priorities, kept(story[step])
-    config = dataclasses.replace(BATCH, priority_exponent=0.5, importance_exponent=0.5, num_sampled_goals=0, batch_size=8192)
+    config = dataclasses.replace(BATCH, priority_exponent=0.5, importance_exponent=0.5, relabelled_per_original=0, batch_size=8192)
     batch = jax.device_get(draw_prioritised_batch(jax.random.key(step), replay, config)[0])
     total = priorities.demonstrations.sum() + priorities.replay.sum()
     expected = {(DEMO, *map(int, place)): priorities.demonstrations[*place] / total for place in np.argwhere(priorities.demonstrations)}
@@ -441,7 +441,7 @@ def test_union_draws_from_both_sources_and_relabelling_can_be_off():
     batch = draw_batch(jax.random.key(0), at(history, 20), NUM_DEMO, config)
     goals = np.asarray(batch.desired_goal)[NUM_DEMO : NUM_DEMO + NUM_RELABELLED, 0]
     assert set(goals.tolist()) == {0.0, 1.0, DEMO}
-    batch = draw_batch(jax.random.key(0), at(history, 20), NUM_DEMO, dataclasses.replace(BATCH, num_sampled_goals=0))
+    batch = draw_batch(jax.random.key(0), at(history, 20), NUM_DEMO, dataclasses.replace(BATCH, relabelled_per_original=0))
     assert np.all(np.asarray(batch.desired_goal)[:, 0] < 0)
 
 
@@ -489,7 +489,7 @@ def test_episodes_judged_by_their_goal_are_rewarded_for_reaching_it(n_step):
     goals[:slots] = episodes.observations[:slots, 2]
     judged = np.arange(2 * slots) < slots
     replay = replay.replace(episodes=episodes.replace(desired_goals=goals), judged_by_goal=judged)
-    config = dataclasses.replace(BATCH, num_sampled_goals=0.5, hindrl_sampling_strategy="final", n_step=n_step)
+    config = dataclasses.replace(BATCH, relabelled_per_original=0.5, hindrl_sampling_strategy="final", n_step=n_step)
     batch = jax.device_get(draw_batch(jax.random.key(2), replay, 0, config))
     kinds = set()
     for row, (state, goal) in enumerate(zip(triples(batch.observation), triples(batch.desired_goal), strict=True)):
@@ -516,15 +516,17 @@ def test_jitted_equals_not_jitted():
 
 
 @pytest.mark.parametrize(
-    ("size", "num_sampled_goals", "demo", "relabelled", "original"),
+    ("size", "relabelled_per_original", "demo", "relabelled", "original"),
     [
         (4096, 4, 409, 2949, 738),  # the thesis's two batches, with r = 0.1 and n = 4
         (12_000, 4, 1200, 8640, 2160),
         (4096, 0.5, 409, 1229, 2458),  # one relabelled row for two others: 3687 / 3
     ],
 )
-def test_composition_of_the_batch(size, num_sampled_goals, demo, relabelled, original):
-    config = BatchConfig(batch_size=size, max_demo_ratio=0.1, num_sampled_goals=num_sampled_goals, hindrl_sampling_strategy="future", n_step=1)
+def test_composition_of_the_batch(size, relabelled_per_original, demo, relabelled, original):
+    config = BatchConfig(
+        batch_size=size, max_demo_ratio=0.1, relabelled_per_original=relabelled_per_original, hindrl_sampling_strategy="future", n_step=1
+    )
     history, _ = replay_history([[3], [2]])
     batch = draw_batch(jax.random.key(0), at(history, 20), num_demo_rows(jnp.asarray(0), config), config)
     assert config.max_demo_rows == demo

@@ -472,7 +472,7 @@ ACHIEVED = GoalConfig(achieved_goal_ratio=1.0)
 
 
 def test_achieved_goals_are_given_to_new_episodes_and_judge_them():
-    env, config = make_env(), make_config(goal=ACHIEVED, batch=BatchConfig(batch_size=64, num_sampled_goals=0, n_step=1))
+    env, config = make_env(), make_config(goal=ACHIEVED, batch=BatchConfig(batch_size=64, relabelled_per_original=0, n_step=1))
     data = train.guidance(corridor_demonstrations((1.0,), env=env), env, config)
 
     @jax.jit

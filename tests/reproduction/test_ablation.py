@@ -124,7 +124,7 @@ def test_the_summaries_speak_of_the_recipe_as_it_is():
     """They say "in place of 5" and the like by hand, so whoever changes the recipe must look at them."""
     recipe = preset("hindrl")
     batch, agent = recipe.batch, recipe.agent
-    assert (batch.n_step, batch.gamma, batch.max_demo_ratio, batch.num_sampled_goals, batch.batch_size) == (5, 0.98, 0.25, 0.25, 256)
+    assert (batch.n_step, batch.gamma, batch.max_demo_ratio, batch.relabelled_per_original, batch.batch_size) == (5, 0.98, 0.25, 0.25, 256)
     assert (agent.num_critics, agent.target_update_rate, agent.bc_weight, agent.initial_alpha) == (2, 0.02, 0.01, 0.002)
     assert (agent.target_entropy, agent.final_target_entropy, agent.actor_average_rate) == (-1.0, -10.0, 0.002)
     assert (recipe.num_envs, recipe.updates_per_iteration) == (16, 2)
@@ -132,9 +132,9 @@ def test_the_summaries_speak_of_the_recipe_as_it_is():
 
 def test_changes_are_made_at_once_and_may_depend_on_the_config():
     config = dataclasses.replace(TINY, steps=1_000)
-    lever = Lever("both", "targets", "", (("algo", "tqcfd"), ("batch.num_sampled_goals", 0.0), ("batch.reach_zero", ablation.half_of_the_run)))
+    lever = Lever("both", "targets", "", (("algo", "tqcfd"), ("batch.relabelled_per_original", 0.0), ("batch.reach_zero", ablation.half_of_the_run)))
     changed = apply(config, lever)  # one after the other they would be refused
-    assert (changed.algo, changed.batch.num_sampled_goals, changed.batch.reach_zero) == ("tqcfd", 0.0, 500)
+    assert (changed.algo, changed.batch.relabelled_per_original, changed.batch.reach_zero) == ("tqcfd", 0.0, 500)
     with pytest.raises(UserError, match="n_step = 0"):
         apply(config, Lever("bad", "targets", "", (("batch.n_step", 0),)))
 

@@ -80,7 +80,7 @@ def flat(config: TrainConfig) -> dict:
 @pytest.mark.parametrize(("algo", "relabelled", "filtered"), [("tqcfd", 0, False), ("hindrl", 4, False), ("smooth-hindrl", 4, True)])
 def test_thesis_preset_is_the_appendix(algo, relabelled, filtered, env, appendix):
     values = flat(preset(algo, "thesis", env=env))
-    expected = appendix | FRAMEWORK | {"algo": algo, "num_sampled_goals": relabelled, "epsilon_filtering": filtered}
+    expected = appendix | FRAMEWORK | {"algo": algo, "relabelled_per_original": relabelled, "epsilon_filtering": filtered}
     assert {name: values[name] for name in expected} == expected
 
 
@@ -114,7 +114,7 @@ def test_default_recipes_differ_by_family_and_the_grid_has_the_defaults_of_the_c
     assert preset("bc", env="ParameterizedReach") == preset("bc", env="FixedParameterizedReach")
     assert retold.demo_reset_ratio > 0.0
     assert preset("tqcfd", env="ParameterizedReach") == preset("tqcfd", env="FixedParameterizedReach")
-    assert preset("tqcfd", env="ParameterizedReach").batch.num_sampled_goals == 0.0
+    assert preset("tqcfd", env="ParameterizedReach").batch.relabelled_per_original == 0.0
 
 
 def test_field_names_are_unique_across_the_nested_configs():

@@ -92,7 +92,7 @@ def test_configs_that_differ_in_numbers_share_one_program(demonstrations):
     assert OTHER_VALUES.keys() == SWEEPABLE.keys()
     config = dataclasses.replace(
         CONFIG,
-        batch=dataclasses.replace(CONFIG.batch, hindrl_sampling_strategy="joint_union", num_sampled_goals=1.0),
+        batch=dataclasses.replace(CONFIG.batch, hindrl_sampling_strategy="joint_union", relabelled_per_original=1.0),
         goal=GoalConfig(m=2),
         agent=dataclasses.replace(CONFIG.agent, final_learning_rate=1e-4, final_bc_weight=0.01),
     )

@@ -1,4 +1,4 @@
-"""Prioritised replay: transitions that the critics are wrong about are drawn more often, and demonstrations with a bonus.
+"""Prioritised replay, as a `core.train.Sampler`: transitions that the critics are wrong about are drawn more often, and demonstrations with a bonus.
 
 A transition of priority p is drawn with a probability in proportion to p^a, a being `priority_exponent`; p is its temporal-difference error when it
 was last drawn, plus a constant (Schaul et al., prioritised experience replay, 2016, eq. 1, proportional), plus the bonus if it is demonstrated, for
@@ -16,8 +16,15 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from hindrl_jax.base.types import Array, Episodes
-from hindrl_jax.config import BatchConfig
+from hindrl_jax.base.environments import Environment
+from hindrl_jax.base.types import Array, Episodes, Transition, tree_where
+from hindrl_jax.config import PriorityConfig, TrainConfig
+from hindrl_jax.core import agent as agents
+from hindrl_jax.core.batch import Rows, rows_of_demonstrations, rows_of_replay
+from hindrl_jax.core.guidance import Guidance
+from hindrl_jax.core.relabel import num_relabelled
+from hindrl_jax.core.replay import ReplayState, written_rows
+from hindrl_jax.core.train import Sampler, TrainState, uniform_sampler
 
 _LEAST_ERROR = 1e-3  # added to every error, so that no transition is lost for ever; that of DQfD (Hester et al., 2018)
 
@@ -39,7 +46,7 @@ class Drawn(struct.PyTreeNode, kw_only=True):
     priority: Array  # (B,) > 0, to the power of `priority_exponent`, when drawn
 
 
-def init(demonstrations: Episodes, empty: Episodes, config: BatchConfig) -> Priorities:
+def init(demonstrations: Episodes, empty: Episodes, config: PriorityConfig) -> Priorities:
     """For N demonstrations, priority 1 and the bonus for each of their transitions, and for the episodes of an empty replay."""
     num_steps = demonstrations.rewards.shape[1]
     is_step = jnp.arange(num_steps)[None] < demonstrations.lengths[:, None]
@@ -50,20 +57,15 @@ def init(demonstrations: Episodes, empty: Episodes, config: BatchConfig) -> Prio
     )
 
 
-def add(priorities: Priorities, rows: Array, lengths: Array, next_rows: Array) -> Priorities:
-    """Lets in what has been written to the replay.
-
-    Args:
-      priorities: the state.
-      rows, lengths: (E,) the episodes that were written to, and how many transitions they hold by now.
-      next_rows: (E,) the episodes that will be written to next: the same, or others where an episode has ended. They are left out.
+def add(priorities: Priorities, before: ReplayState, after: ReplayState) -> Priorities:
+    """Lets in what has been written to the replay by a step of all environments.
 
     Returns:
-      The new state: transitions of ended episodes have the largest priority so far.
+      The new state: transitions of ended episodes have the largest priority so far; those of episodes that are being written are left out.
     """
-    is_step = jnp.arange(priorities.replay.shape[1])[None] < lengths[:, None]
-    written = priorities.replay.at[rows].set(jnp.where(is_step, priorities.largest, 0.0))
-    return priorities.replace(replay=written.at[next_rows].set(0.0))
+    is_step = jnp.arange(priorities.replay.shape[1])[None] < before.step[:, None] + 1
+    written = priorities.replay.at[written_rows(before)].set(jnp.where(is_step, priorities.largest, 0.0))
+    return priorities.replace(replay=written.at[written_rows(after)].set(0.0))
 
 
 def draw(key: Array, priorities: Priorities, num_samples: int) -> Drawn:
@@ -107,7 +109,7 @@ def _draw_row(key: Array, weights: Array, num_samples: int) -> Array:
     return jnp.searchsorted(sums, jax.random.uniform(key, (num_samples,)) * sums[-1], side="right")
 
 
-def importance_weights(drawn: Drawn, config: BatchConfig) -> Array:
+def importance_weights(drawn: Drawn, config: PriorityConfig) -> Array:
     """What corrects the loss for rows that are drawn more often than others (Schaul et al., 2016, section 3.4): (B,) in (0, 1].
 
     The weights (1 / (M P))^b over the largest of the batch, P being the probability of the row, b `importance_exponent` and M the number of
@@ -116,7 +118,7 @@ def importance_weights(drawn: Drawn, config: BatchConfig) -> Array:
     return (jnp.min(drawn.priority) / drawn.priority) ** config.importance_exponent
 
 
-def assign(priorities: Priorities, drawn: Drawn, errors: Array, config: BatchConfig) -> Priorities:
+def assign(priorities: Priorities, drawn: Drawn, errors: Array, config: PriorityConfig) -> Priorities:
     """Gives the drawn transitions the priorities of their errors; of one that was drawn twice the larger error counts.
 
     Args:
@@ -139,3 +141,56 @@ def assign(priorities: Priorities, drawn: Drawn, errors: Array, config: BatchCon
         replay=write(priorities.replay, ~drawn.is_demonstration, powers),
         largest=jnp.maximum(priorities.largest, jnp.max(powers)),
     )
+
+
+def sample_batch(key: Array, state: TrainState, guidance: Guidance, env: Environment, config: TrainConfig) -> tuple[Transition, Drawn]:
+    """Draws the batch of one gradient step by the priorities of the transitions.
+
+    Of the rows that happen to come from the replay, n / (n + 1) (rounded down) are relabelled, or fewer where intersections are empty.
+
+    Args:
+      key: random key.
+      state: its replay, and priorities as its `sampler`.
+      guidance, env, config: as for `core.batch.sample_batch`.
+
+    Returns:
+      A batch of `batch_size` rows in no particular order, with weights, and where its rows come from.
+    """
+    key_draw, key_goal = jax.random.split(key)
+    drawn = draw(key_draw, state.sampler, config.batch.batch_size)
+    # How many rows come from where is not known when this is compiled, so each is read from both tables, and one reading thrown away.
+    replayed = ~drawn.is_demonstration
+    share = num_relabelled(jnp.sum(replayed), config.batch.relabelled_per_original)
+    relabelled = replayed & (jnp.cumsum(replayed) <= share)  # the first of them: all are drawn alike
+    from_replay = rows_of_replay(key_goal, state.replay, Rows(row=drawn.rows, step=drawn.steps, relabelled=relabelled), guidance, env, config)
+    from_demonstrations = rows_of_demonstrations(guidance.demonstrations, drawn.rows, drawn.steps, env, config)
+    batch = tree_where(replayed, from_replay, from_demonstrations)
+    return batch.replace(weight=importance_weights(drawn, config.priority)), drawn
+
+
+def prioritised_sampler(env: Environment, config: TrainConfig) -> Sampler:
+    """Draws transitions by their priorities, which are renewed after the gradient steps of an iteration."""
+
+    def draw_batches(key: Array, state: TrainState, guidance: Guidance) -> tuple[Transition, tuple[Drawn, Array]]:
+        key_batch, key_errors = jax.random.split(key)
+        keys = jax.random.split(key_batch, config.updates_per_iteration)
+        batches, drawn = jax.vmap(lambda key: sample_batch(key, state, guidance, env, config))(keys)
+        return batches, (drawn, key_errors)
+
+    def renew(state: TrainState, batches: Transition, said: tuple[Drawn, Array]) -> Priorities:
+        def errors_of(key: Array, batch: Transition) -> tuple[Array, Array]:
+            key, key_error = jax.random.split(key)
+            return key, agents.td_error(key_error, state.agent, batch, config)
+
+        drawn, key_errors = said
+        _, errors = jax.lax.scan(errors_of, key_errors, batches)
+        return assign(state.sampler, drawn, errors, config.priority)
+
+    return Sampler(
+        init=lambda guidance, replay: init(guidance.demonstrations, replay.episodes, config.priority), record=add, draw=draw_batches, learned=renew
+    )
+
+
+def sampler_for(env: Environment, config: TrainConfig) -> Sampler:
+    """The sampler that a config asks for."""
+    return prioritised_sampler(env, config) if config.priority.is_used else uniform_sampler(env, config)

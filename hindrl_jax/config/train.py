@@ -1,0 +1,99 @@
+"""A whole training run."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Literal
+
+from hindrl_jax.base.checks import check, check_types
+from hindrl_jax.config.agent import AgentConfig
+from hindrl_jax.config.batch import BatchConfig
+from hindrl_jax.config.goal import GoalConfig
+from hindrl_jax.config.priority import PriorityConfig
+from hindrl_jax.config.quirks import QuirksConfig
+
+Algorithm = Literal["bc", "tqcfd", "hindrl", "smooth-hindrl"]
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """A whole training run, except the environment and the demonstrations."""
+
+    algo: Algorithm = "hindrl"
+    """Which of the four models: bc, tqcfd (no relabelling), hindrl, smooth-hindrl."""
+    steps: int = 160_000
+    """Environment steps of the run per seed, rounded up to a tenth of eval_every; for bc, which takes none, gradient steps."""
+    num_envs: int = 16
+    """Environments stepped side by side."""
+    updates_per_iteration: int = 2
+    """Gradient steps after each (vectorised) environment step."""
+    learning_starts: int = 1_600
+    """Environment steps with uniformly random actions before the first gradient step; at least one horizon in each environment is taken."""
+    demo_reset_ratio: float = 0.0
+    """Share of training episodes that begin in a demonstrated state, drawn uniformly, with the steps that it had left (Nair et al., overcoming
+    exploration in reinforcement learning with demonstrations, 2018). Evaluations never do."""
+    demo_reset_curriculum: float = 0.0
+    """Share of the run over which those states widen from the end of each demonstration to all of it: a reverse curriculum (RFCL, Tao et al.,
+    2024, widens by success instead). 0 draws from all of them throughout."""
+    random_truncation: float = 0.0
+    """Probability with which a training episode is cut off after a step, as a time-out cuts it: the future value still counts (unless
+    timeouts_are_terminal). Episodes that stand still are left sooner, and more are begun. Evaluations are never cut. Each episode keeps room for a
+    whole horizon in the replay, which so holds fewer transitions than buffer_size; and since an episode is drawn before one of its transitions,
+    those of short episodes are drawn more often."""
+    bc_warm_start: int = 0
+    """Gradient steps of behaviour cloning alone before the first of reinforcement learning, after the random actions of learning_starts."""
+    agent_resets: tuple[float, ...] = ()
+    """Shares of the run, in order, after which networks, optimisers and their schedules begin anew, while the replay stays (Nikishin et al., The
+    primacy bias in deep reinforcement learning, 2022)."""
+    buffer_size: int = 500_000
+    """Transitions that the replay holds."""
+    eval_every: int = 4_000
+    """Environment steps (bc: gradient steps) between evaluations."""
+    eval_episodes: int = 100
+    """Episodes of each evaluation, with the policy's mean action."""
+    batch: BatchConfig = dataclasses.field(default_factory=BatchConfig)
+    goal: GoalConfig = dataclasses.field(default_factory=GoalConfig)
+    agent: AgentConfig = dataclasses.field(default_factory=AgentConfig)
+    priority: PriorityConfig = dataclasses.field(default_factory=PriorityConfig)
+    quirks: QuirksConfig = dataclasses.field(default_factory=QuirksConfig)
+
+    def __post_init__(self) -> None:
+        check_types(self)
+        counts = ("steps", "num_envs", "updates_per_iteration", "buffer_size", "eval_every", "eval_episodes")
+        check(
+            self,
+            **{name: (getattr(self, name) >= 1, "at least 1") for name in counts},
+            learning_starts=(self.learning_starts >= 0, "0 or more"),
+            demo_reset_ratio=(0.0 <= self.demo_reset_ratio <= 1.0, "between 0 and 1"),
+            demo_reset_curriculum=(0.0 <= self.demo_reset_curriculum <= 1.0, "between 0 and 1"),
+            random_truncation=(0.0 <= self.random_truncation < 1.0, "0 or more, and less than 1"),
+            bc_warm_start=(self.bc_warm_start >= 0, "0 or more"),
+            agent_resets=(
+                all(0.0 < share < 1.0 for share in self.agent_resets) and sorted(set(self.agent_resets)) == list(self.agent_resets),
+                "shares between 0 and 1, each larger than the one before",
+            ),
+        )
+        if self.demo_reset_curriculum > 0.0 and self.demo_reset_ratio == 0.0:
+            raise ValueError(f"demo_reset_curriculum = {self.demo_reset_curriculum} is of no use while demo_reset_ratio = 0: raise that, too")
+        if self.algo == "bc":
+            given: dict[str, Any] = {"bc_warm_start": self.bc_warm_start, "q_filter": self.agent.q_filter}
+            given |= {"priority_exponent": self.priority.priority_exponent, "base": self.agent.base != "tqc" and self.agent.base}
+            for name, value in given.items():
+                if value:
+                    raise ValueError(f"{name} = {value} has no effect on bc, which is behaviour cloning alone: drop it, or choose another algo")
+        if self.algo == "tqcfd" and self.batch.relabelled_per_original > 0:
+            raise ValueError(
+                f"tqcfd does not relabel, but relabelled_per_original = {self.batch.relabelled_per_original}: set it to 0, or choose hindrl"
+            )
+        if self.algo == "smooth-hindrl" and not self.goal.epsilon_filtering:
+            raise ValueError("smooth-hindrl is hindrl with epsilon_filtering, which is off: turn it on, or choose hindrl")
+        if self.batch.reach_zero is not None and self.priority.is_used:
+            raise ValueError(
+                f"reach_zero = {self.batch.reach_zero} is of no use with priority_exponent = {self.priority.priority_exponent}, by which the share "
+                "of demonstrations follows from their priorities: set one of them to None or 0"
+            )
+
+    @property
+    def learns_from_rollouts(self) -> bool:
+        """Whether environments are stepped and returns are learnt; behaviour cloning does neither."""
+        return self.algo != "bc"

@@ -1,0 +1,85 @@
+"""What training takes from the demonstrations: epsilon, goals to relabel with, goals for rollouts, states to begin in."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from hindrl_jax.base.environments import Environment, action_to_env
+from hindrl_jax.base.errors import UserError
+from hindrl_jax.base.types import Array, Episodes
+from hindrl_jax.config import TrainConfig
+from hindrl_jax.core import goals
+from hindrl_jax.core.goals import GoalTable
+from hindrl_jax.core.inputs import InputScale, input_scale
+from hindrl_jax.core.rollout import StartTable
+
+
+class Guidance(struct.PyTreeNode, kw_only=True):
+    """What training takes from the demonstrations; constant during a run."""
+
+    demonstrations: Episodes  # N episodes
+    goals: GoalTable  # goals for task-conditioned relabelling, filtered or not
+    behavioural_goals: GoalTable  # goals for rollouts
+    epsilon: Array  # (G,) half-width of the goal box
+    scale: InputScale  # typical size of the networks' inputs
+    starts: StartTable | None  # demonstrated states in which training episodes may begin; None if none do
+
+
+def guidance(demonstrations: Episodes, env: Environment, config: TrainConfig) -> Guidance:
+    """Epsilon (thesis eq. 4.7), goal database, filter (algorithm 6) and behavioural goals (algorithm 5) from demonstrations (N, ...).
+
+    Raises:
+      UserError: if training episodes are to begin in demonstrated states, and the demonstrations come without their states.
+    """
+    starts = None
+    if config.demo_reset_ratio > 0.0:
+        if demonstrations.states is None:
+            raise UserError(f"demo_reset_ratio = {config.demo_reset_ratio} needs the states of the demonstrations: give them, or set it to 0")
+        starts = StartTable(states=demonstrations.states, lengths=demonstrations.lengths)
+    demonstrations = _with_quirks(demonstrations.replace(states=None), env, config)
+    observations, lengths = demonstrations.observations, demonstrations.lengths
+    achieved = env.achieved_goal(observations)
+    if config.goal.epsilon is None:
+        epsilon = goals.epsilon_from_demonstrations(achieved, lengths, steps=config.goal.epsilon_steps, deviations=config.goal.epsilon_deviations)
+    else:
+        epsilon = jnp.full(env.goal_dim, config.goal.epsilon)
+    behavioural_goals, desired_goals = _behavioural_goals(demonstrations, achieved, env, config)
+    keep = goals.is_visited(lengths - int(config.quirks.exclude_last_goal), achieved.shape[1])
+    if config.goal.epsilon_filtering:
+        keep &= jax.vmap(lambda path: goals.epsilon_filter(path, epsilon, inclusive=not config.quirks.strict_goal_test))(achieved)
+    return Guidance(
+        demonstrations=demonstrations.replace(desired_goals=desired_goals),
+        goals=goals.goal_table(observations, achieved, keep),
+        behavioural_goals=behavioural_goals,
+        epsilon=epsilon,
+        scale=input_scale(observations, achieved, goals.is_visited(lengths, achieved.shape[1]), config.agent),
+        starts=starts,
+    )
+
+
+def _behavioural_goals(demonstrations: Episodes, achieved: Array, env: Environment, config: TrainConfig) -> tuple[GoalTable, Array]:
+    """The goals of rollouts, and (N, G) those that the demonstrations were acted under."""
+    if config.goal.behavioural_goals == "environment":
+        desired_goals = demonstrations.desired_goals
+        return GoalTable(goals=desired_goals, count=jnp.asarray(desired_goals.shape[0])), desired_goals
+    if config.goal.behavioural_goals == "task":
+        table = goals.constant_goal(env.task_goal())
+        return table, jnp.broadcast_to(table.goals, (demonstrations.lengths.shape[0], env.goal_dim))
+    table = goals.final_goals(achieved, demonstrations.lengths)
+    return table, table.goals
+
+
+def _with_quirks(demonstrations: Episodes, env: Environment, config: TrainConfig) -> Episodes:
+    """The demonstrations as the original code pairs and scales them, if it is to be followed in that."""
+    if config.quirks.misaligned_demo_actions:
+        demonstrations = demonstrations.replace(
+            observations=demonstrations.observations[:, 1:],
+            actions=demonstrations.actions[:, :-1],
+            rewards=demonstrations.rewards[:, 1:],
+            lengths=demonstrations.lengths - 1,
+        )
+    if config.quirks.unscaled_demo_actions:
+        demonstrations = demonstrations.replace(actions=action_to_env(demonstrations.actions, env))
+    return demonstrations
