@@ -67,12 +67,12 @@ def uniform_sampler(env: Environment, config: TrainConfig) -> Sampler:
 
 
 def init(
-    key: Array, data: Guidance, env: Environment, config: TrainConfig, *, sampler: Sampler | None = None, begun: RolloutState | None = None
+    key: Array, guidance: Guidance, env: Environment, config: TrainConfig, *, sampler: Sampler | None = None, begun: RolloutState | None = None
 ) -> TrainState:
     """A fresh agent, an empty replay and `num_envs` episodes about to begin.
 
     Args:
-      key, data, env, config: see the module's other functions.
+      key, guidance, env, config: see the module's other functions.
       sampler: how batches will be drawn.
       begun: the episodes, where they have begun outside JAX.
 
@@ -85,10 +85,10 @@ def init(
     notes |= {JUDGED_BY_GOAL: False} if config.goal.has_achieved_goals else {}
     empty = replay.init(env, num_envs=config.num_envs, capacity=capacity, notes=notes)
     return TrainState(
-        agent=agents.init(key_agent, data.scale, config, action_dim=env.action_dim),
+        agent=agents.init(key_agent, guidance.scale, config, action_dim=env.action_dim),
         replay=empty,
-        rollout=_with_notes(_new_episodes(key_rollout, data, env, config, 0.0) if begun is None else begun, config),
-        sampler=() if sampler is None else sampler.init(data, empty),
+        rollout=_with_notes(_new_episodes(key_rollout, guidance, env, config, 0.0) if begun is None else begun, config),
+        sampler=() if sampler is None else sampler.init(guidance, empty),
         key=key_train,
         env_steps=jnp.asarray(0),
         updates=jnp.asarray(0),
@@ -97,12 +97,12 @@ def init(
     )
 
 
-def _new_episodes(key: Array, data: Guidance, env: Environment, config: TrainConfig, progress: Array | float) -> RolloutState:
+def _new_episodes(key: Array, guidance: Guidance, env: Environment, config: TrainConfig, progress: Array | float) -> RolloutState:
     demo_resets = None
-    if data.starts is not None:
+    if guidance.starts is not None:
         share = jnp.minimum(progress / config.demo_reset_curriculum, 1.0) if config.demo_reset_curriculum > 0.0 else 1.0
-        demo_resets = DemoResets(starts=data.starts, ratio=config.demo_reset_ratio, share=share)
-    return rollout.reset(key, env, data.behavioural_goals, config.num_envs, demo_resets)
+        demo_resets = DemoResets(starts=guidance.starts, ratio=config.demo_reset_ratio, share=share)
+    return rollout.reset(key, env, guidance.behavioural_goals, config.num_envs, demo_resets)
 
 
 def _with_notes(episodes: RolloutState, config: TrainConfig) -> RolloutState:
@@ -175,28 +175,28 @@ def act_at_random(env: Environment) -> Act:
     return act
 
 
-def _interact(key: Array, state: TrainState, data: Guidance, env: Environment, config: TrainConfig, act: Act) -> TrainState:
+def _interact(key: Array, state: TrainState, guidance: Guidance, env: Environment, config: TrainConfig, act: Act) -> TrainState:
     """One step of every environment, stored in the replay."""
     key_act, key_reset, key_goals, key_nearby, key_cut = jax.random.split(key, 5)
     before = state.rollout
     action = act(key_act, before.observation, before.desired_goal)
-    begun = _with_notes(_new_episodes(key_reset, data, env, config, _progress(state, config)), config)
+    begun = _with_notes(_new_episodes(key_reset, guidance, env, config, _progress(state, config)), config)
     cut = None
     if config.random_truncation > 0.0:
         cut = jax.random.bernoulli(key_cut, config.random_truncation, (config.num_envs,))
     after, time_step = rollout.step(before, begun, action, env, cut=cut)
-    state = record(key_nearby, state, (action, time_step), data, env, config)
+    state = record(key_nearby, state, (action, time_step), guidance, env, config)
     return continue_from(key_goals, state, after, time_step, env, config)
 
 
-def record(key: Array, state: TrainState, taken: tuple[Array, TimeStep], data: Guidance, env: Environment, config: TrainConfig) -> TrainState:
+def record(key: Array, state: TrainState, taken: tuple[Array, TimeStep], guidance: Guidance, env: Environment, config: TrainConfig) -> TrainState:
     """Stores one step of every environment in the replay.
 
     Args:
       key: random key.
       state: before the step.
       taken: the actions (E, A) in [-1, 1], and the time steps (E, ...) that came of them, their observations the true next ones.
-      data, env, config: the run's; of the environment, only what goals and actions are.
+      guidance, env, config: the run's; of the environment, only what goals and actions are.
 
     Returns:
       The state, whose episodes are still those of before the step, see `continue_from`.
@@ -204,7 +204,7 @@ def record(key: Array, state: TrainState, taken: tuple[Array, TimeStep], data: G
     before, (action, time_step) = state.rollout, taken
     notes = dict(before.notes)
     if config.batch.uses_intersections:
-        notes[NEARBY_GOAL] = nearby_goal(key, data.goals, time_step.observation, goal_test(data, env, config))
+        notes[NEARBY_GOAL] = nearby_goal(key, guidance.goals, time_step.observation, goal_test(guidance, env, config))
     recorded = RecordedStep(
         observation=before.observation,
         desired_goal=before.desired_goal,
@@ -227,21 +227,21 @@ def continue_from(key: Array, state: TrainState, after: RolloutState, time_step:
 
 
 def collect(
-    state: TrainState, data: Guidance, *, env: Environment, config: TrainConfig, num_iterations: int, sampler: Sampler | None = None
+    state: TrainState, guidance: Guidance, *, env: Environment, config: TrainConfig, num_iterations: int, sampler: Sampler | None = None
 ) -> TrainState:
     """Fills the replay by uniformly random actions: `num_iterations` steps of every environment."""
     sampler = sampler or uniform_sampler(env, config)
 
     def iteration(state: TrainState, _: None) -> tuple[TrainState, None]:
         key, key_interact = jax.random.split(state.key)
-        after = _interact(key_interact, state.replace(key=key), data, env, config, act_at_random(env))
+        after = _interact(key_interact, state.replace(key=key), guidance, env, config, act_at_random(env))
         return after.replace(sampler=sampler.record(state.sampler, state.replay, after.replay)), None
 
     return jax.lax.scan(iteration, state, length=num_iterations)[0]
 
 
 def learn(
-    state: TrainState, data: Guidance, *, env: Environment, config: TrainConfig, num_iterations: int, sampler: Sampler | None = None
+    state: TrainState, guidance: Guidance, *, env: Environment, config: TrainConfig, num_iterations: int, sampler: Sampler | None = None
 ) -> tuple[TrainState, Metrics]:
     """`num_iterations` times: one step of every environment, then `updates_per_iteration` gradient steps.
 
@@ -253,9 +253,9 @@ def learn(
     def iteration(state: TrainState, _: None) -> tuple[TrainState, Metrics]:
         key, key_interact, key_batch, key_updates = jax.random.split(state.key, 4)
         act = make_policy(agents.policy(state.agent, average=False), env, config, stochastic=True)
-        after = _interact(key_interact, state.replace(key=key), data, env, config, act)
+        after = _interact(key_interact, state.replace(key=key), guidance, env, config, act)
         state = after.replace(sampler=sampler.record(state.sampler, state.replay, after.replay))
-        batches, drawn = sampler.draw(key_batch, state, data)
+        batches, drawn = sampler.draw(key_batch, state, guidance)
         state, metrics = gradient_steps(key_updates, state, batches, env, config)
         return state.replace(sampler=sampler.learned(state, batches, drawn)), metrics
 
@@ -278,12 +278,12 @@ def gradient_steps(key: Array, state: TrainState, batches: Transition, env: Envi
     return state.replace(agent=agent, updates=state.updates + num_updates), jax.tree.map(jnp.mean, metrics)
 
 
-def clone(state: TrainState, data: Guidance, *, env: Environment, config: TrainConfig, num_iterations: int) -> tuple[TrainState, Metrics]:
+def clone(state: TrainState, guidance: Guidance, *, env: Environment, config: TrainConfig, num_iterations: int) -> tuple[TrainState, Metrics]:
     """`num_iterations` gradient steps of behaviour cloning on demonstration batches; no environment is stepped."""
 
     def gradient_step(state: TrainState, _: None) -> tuple[TrainState, Metrics]:
         key, key_batch, key_update = jax.random.split(state.key, 3)
-        batch = sample_demonstrations(key_batch, data.demonstrations, env, config)
+        batch = sample_demonstrations(key_batch, guidance.demonstrations, env, config)
         progress = 0.0 if config.learns_from_rollouts else jnp.minimum(state.updates / config.steps, 1.0)
         moment = schedule(progress, state.updates, config.agent, action_dim=env.action_dim)
         agent, metrics = agents.update_bc(key_update, state.agent, batch, moment, config)
@@ -293,6 +293,6 @@ def clone(state: TrainState, data: Guidance, *, env: Environment, config: TrainC
     return state, jax.tree.map(jnp.mean, metrics)
 
 
-def evaluate(key: Array, policy: Policy, data: Guidance, *, env: Environment, config: TrainConfig, num_episodes: int) -> Evaluation:
+def evaluate(key: Array, policy: Policy, guidance: Guidance, *, env: Environment, config: TrainConfig, num_episodes: int) -> Evaluation:
     """Plays fresh episodes with the policy's mean actions, see `rollout.evaluate`."""
-    return rollout.evaluate(key, env, data.behavioural_goals, make_policy(policy, env, config, stochastic=False), num_episodes)
+    return rollout.evaluate(key, env, guidance.behavioural_goals, make_policy(policy, env, config, stochastic=False), num_episodes)

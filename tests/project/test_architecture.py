@@ -159,6 +159,17 @@ def test_no_file_is_long():
     assert {module: length for module, path in SOURCES.items() if (length := len(path.read_text().splitlines())) > 350} == {}
 
 
+@pytest.mark.parametrize("module", [module for module in ROOMS if room_of(module) == "core"])
+def test_functions_of_the_core_take_few_parameters(module):
+    functions = [node for node in ast.walk(ast.parse(SOURCES[module].read_text())) if isinstance(node, ast.FunctionDef)]
+    assert [function.name for function in functions if num_parameters(function) > 6] == []
+
+
+def num_parameters(function):
+    names = [parameter.arg for parameter in (*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs)]
+    return len([name for name in names if name not in ("self", "cls")])
+
+
 def test_every_room_says_what_it_is_for():
     for room in FLOOR:
         assert len(ast.get_docstring(ast.parse(SOURCES[f"hindrl_jax.{room}"].read_text())).split()) > 8
