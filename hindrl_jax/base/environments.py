@@ -62,6 +62,11 @@ def compiler_options(env: Environment) -> dict[str, Any]:
     return getattr(env, "compiler_options", {})
 
 
+def on_host(env: Any) -> bool:
+    """Whether the environment is simulated outside JAX, by robosuite: one episode after the other, and never inside a compiled program."""
+    return getattr(env, "backend", None) == "robosuite"
+
+
 @runtime_checkable
 class RestorableEnvironment(Environment, Protocol):
     """An environment whose state can be written down as a vector and read back: to be drawn, or to begin an episode there."""

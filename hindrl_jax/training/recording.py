@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hindrl_jax.base.environments import RestorableEnvironment, action_from_env, compiler_options
+from hindrl_jax.base.environments import RestorableEnvironment, action_from_env, compiler_options, on_host
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Array, Episodes, tree_where
 from hindrl_jax.experts.robosuite_arm import play_in_robosuite
@@ -63,11 +63,6 @@ def play(key: Array, env: RestorableEnvironment, act: Act, num_episodes: int) ->
         )
 
     return jax.vmap(episode)(jax.random.split(key, num_episodes))
-
-
-def on_host(env: Any) -> bool:
-    """Whether the environment is simulated outside JAX, by robosuite: one episode after the other, and never inside a compiled program."""
-    return getattr(env, "backend", None) == "robosuite"
 
 
 def player(env: RestorableEnvironment, act: Act, num_episodes: int) -> Callable[[Array], Episodes]:
