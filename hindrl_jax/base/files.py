@@ -62,11 +62,26 @@ def check_can_write(path: Path, *, overwrite: bool) -> None:
     """
     if path.is_dir():
         raise UserError(f"{path}: is a folder; name a file")
+    check_free(path, f"{path}", overwrite=overwrite, otherwise="choose another place")
+
+
+def check_free(path: Path, where: str, *, overwrite: bool, otherwise: str) -> None:
+    """Makes sure that a file or folder can be put in this place.
+
+    Args:
+      path: the place.
+      where: begins the message.
+      overwrite: whether what is there may be replaced.
+      otherwise: what to do about a folder that cannot be written to.
+
+    Raises:
+      UserError: if not.
+    """
     if path.exists() and not overwrite:
-        raise UserError(f"{path}: exists already; replace it with --overwrite (overwrite=True), or choose another name")
+        raise UserError(f"{where}: exists already; replace it with --overwrite (overwrite=True), or choose another name")
     reason = why_unwritable(path.absolute().parent)
     if reason:
-        raise UserError(f"{path}: cannot be written, since {reason}; choose another place")
+        raise UserError(f"{where}: cannot be written, since {reason}; {otherwise}")
 
 
 def why_unwritable(folder: Path) -> str | None:

@@ -15,7 +15,7 @@ import tyro
 from rich import box
 from rich.table import Table
 
-from hindrl_jax.base.environments import RestorableEnvironment
+from hindrl_jax.base.environments import RestorableEnvironment, on_host
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.files import check_can_write, disk_trouble
 from hindrl_jax.base.types import Episodes
@@ -33,14 +33,15 @@ from hindrl_jax.demonstrations.convert import (
     understand,
     write,
 )
-from hindrl_jax.demonstrations.hdf5 import Recording, padded, save_demonstrations, summarise_recording
+from hindrl_jax.demonstrations.episodes import padded
+from hindrl_jax.demonstrations.hdf5 import save_demonstrations
+from hindrl_jax.demonstrations.recording import Recording, summarise_recording
 from hindrl_jax.experts.by_hand import record_by_hand
 from hindrl_jax.experts.robosuite_arm import DeviceName
 from hindrl_jax.plotting.curves import save_filter
 from hindrl_jax.runs.reader import draw_episodes
 from hindrl_jax.tasks.registry import TASKS, make, task
 from hindrl_jax.training.experiment import record_demonstrations
-from hindrl_jax.training.recording import on_host
 
 
 @dataclasses.dataclass(frozen=True)

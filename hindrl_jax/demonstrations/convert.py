@@ -15,8 +15,11 @@ from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.files import check_can_write, write_atomically
 from hindrl_jax.base.types import Episodes
 from hindrl_jax.demonstrations import minari, npz, robomimic
-from hindrl_jax.demonstrations.foreign import ForeignRecording, Interpretation, Solved, interpret
-from hindrl_jax.demonstrations.hdf5 import Recording, as_episodes, check_recording, load_demonstrations, read_recording, write_recording
+from hindrl_jax.demonstrations.episodes import as_episodes
+from hindrl_jax.demonstrations.foreign import ForeignRecording, Interpretation, Solved
+from hindrl_jax.demonstrations.hdf5 import check_recording, load_demonstrations, read_recording, write_recording
+from hindrl_jax.demonstrations.interpret import interpret
+from hindrl_jax.demonstrations.recording import Recording
 from hindrl_jax.tasks.registry import TASKS, make
 
 __all__ = [

@@ -29,16 +29,14 @@ from typing import Any
 import numpy as np
 
 from hindrl_jax.base.errors import UserError, one_line
-from hindrl_jax.base.files import why_unwritable
-from hindrl_jax.demonstrations.foreign import MINARI_OBSERVATIONS, SOURCE, ForeignDemonstration, ForeignRecording
-from hindrl_jax.demonstrations.hdf5 import OBSERVATION_KEYS, Demonstration, Recording, plain
+from hindrl_jax.base.files import check_free
+from hindrl_jax.demonstrations._minari_episodes import as_demonstration, as_episode, as_source_episode, source_metadata
+from hindrl_jax.demonstrations.foreign import ForeignRecording
+from hindrl_jax.demonstrations.recording import Recording, plain
 from hindrl_jax.tasks.registry import TASKS
 
 PREFIX = "minari:"
 GYMNASIUM = "gymnasium:"  # begins the names of environments that are not ours
-_INFOS, _TERMINATIONS, _TRUNCATIONS = "minari/infos/", "minari/terminations", "minari/truncations"
-_SUCCESS = ("is_success", "success")  # what environments call it in their infos
-_COMPUTED = ("id", "total_steps")  # what Minari itself writes about each episode
 _OURS = "hindrl"  # the key in Minari's metadata of what only we know
 
 
@@ -89,7 +87,7 @@ def read(name: str) -> ForeignRecording:
         env_kwargs=env_kwargs,
         expert=ours and ours["expert"],
         demonstrations=tuple(
-            _demonstration(source, n, episode, metadata, ours is not None)
+            as_demonstration(source, n, episode, metadata, ours=ours is not None)
             for n, (episode, metadata) in enumerate(zip(episodes, episode_metadata, strict=True))
         ),
         observation_keys=("observation", "achieved_goal") if ours is None and env_name.startswith(GYMNASIUM) else ("observation",),
@@ -120,69 +118,6 @@ def _bounds(source: str, space: Any) -> tuple[np.ndarray, np.ndarray]:
     return space.low, space.high
 
 
-def _demonstration(source: str, number: int, episode: Any, metadata: dict[str, Any], ours: bool) -> ForeignDemonstration:
-    where = f"{source}: episode {number}"
-    leaves = _leaves(episode.observations, "observation")
-    length = len(episode.rewards)
-    modalities = {}
-    for key, rows in leaves.items():
-        if not isinstance(rows, np.ndarray) or rows.dtype.kind not in "biuf":
-            raise UserError(f"{where}: observations {key} are not numbers, which is not supported")
-        if rows.ndim <= 2:
-            modalities[key] = rows[:, None] if rows.ndim == 1 else rows
-    for what, rows in {**modalities, "actions": episode.actions, "rewards": episode.rewards}.items():
-        if not np.isfinite(rows).all():
-            raise UserError(f"{where}: {what} is not finite in row {np.argwhere(~np.isfinite(rows))[0][0]}; delete this episode")
-    infos = _leaves(episode.infos or {}, "")
-    states = infos.get("state") if ours else None
-    extras: dict[str, np.ndarray] = {}
-    if not ours:
-        extras = {"actions": episode.actions, "rewards": episode.rewards, _TERMINATIONS: episode.terminations}
-        extras |= {MINARI_OBSERVATIONS + key: rows for key, rows in leaves.items()} | {_INFOS + key: _storable(rows) for key, rows in infos.items()}
-        if not np.array_equal(episode.truncations, _default_truncations(length, bool(episode.terminations[-1]))):
-            extras[_TRUNCATIONS] = episode.truncations
-    return ForeignDemonstration(
-        name=f"demo_{number}",
-        modalities=modalities,
-        actions=episode.actions,
-        rewards=episode.rewards,
-        dones=_dones(episode.terminations, infos),
-        states=states,
-        extras=extras,
-        attributes={} if ours else {"minari": json.dumps({key: value for key, value in plain(metadata).items() if key not in _COMPUTED})},
-    )
-
-
-def _dones(terminations: np.ndarray, infos: dict[str, Any]) -> np.ndarray:
-    for key in _SUCCESS:
-        if key in infos and np.shape(infos[key]) == (len(terminations) + 1,):
-            return np.asarray(infos[key])[1:].astype(bool)
-    return terminations
-
-
-def _leaves(tree: Any, root: str) -> dict[str, Any]:
-    """The arrays of nested dictionaries, by their path; `root` names a single array."""
-    if not isinstance(tree, dict):
-        return {root: tree}
-    found: dict[str, Any] = {}
-    for key, value in tree.items():
-        found |= {f"{key}/{below}" if below else key: leaf for below, leaf in _leaves(value, "").items()}
-    return found
-
-
-def _storable(rows: Any) -> np.ndarray:
-    """HDF5 has texts as bytes only."""
-    rows = np.asarray(rows)
-    return np.char.encode(rows) if rows.dtype.kind == "U" else rows.astype("S") if rows.dtype.kind == "O" else rows
-
-
-def _default_truncations(length: int, terminated: bool) -> np.ndarray:
-    return (np.arange(length) == length - 1) & (not terminated)
-
-
-# ------------------------------------------------------------------------------------------------------------------------------- writing
-
-
 def check_writable(name: str, *, overwrite: bool) -> None:
     """Makes sure, before any work is done, that a dataset of that name can be written.
 
@@ -192,11 +127,7 @@ def check_writable(name: str, *, overwrite: bool) -> None:
     folder = _folder(name)
     if folder.exists() and not (folder / "data").is_dir():
         raise UserError(f"{PREFIX}{name}: {folder} exists already and is no dataset; choose another name")
-    if folder.exists() and not overwrite:
-        raise UserError(f"{PREFIX}{name}: exists already in {folder.parent}; allow overwriting it with --overwrite, or choose another name")
-    reason = why_unwritable(folder.absolute().parent)
-    if reason:
-        raise UserError(f"{PREFIX}{name}: cannot be written, since {reason}; set MINARI_DATASETS_PATH to another place")
+    check_free(folder, f"{PREFIX}{name} in {folder.parent}", overwrite=overwrite, otherwise="set MINARI_DATASETS_PATH to another place")
 
 
 def write(name: str, recording: Recording, *, overwrite: bool) -> None:
@@ -257,20 +188,20 @@ def _fill(data: Path, name: str, recording: Recording) -> None:
         serialization = importlib.import_module("minari.serialization")
         spaces = {key: serialization.deserialize_space(metadata[key]) for key in ("observation_space", "action_space")}
         spec = None  # it is among the metadata, as text
-        buffers = [_source_buffer(demo, spaces["observation_space"]) for demo in recording.demonstrations]
+        buffers = [as_source_episode(demo, spaces["observation_space"]) for demo in recording.demonstrations]
         about = {key: value for key, value in metadata.items() if key not in _WRITTEN_BY_MINARI}
         about |= {key: set(about[key]) for key in ("author", "author_email") if key in about}
         jpeg = bool(metadata.get("jpeg_encoding", True))
     else:
         spaces, jpeg, spec = _spaces(recording), True, _specification(recording)
-        buffers = [_buffer(demo) for demo in recording.demonstrations]
+        buffers = [as_episode(demo) for demo in recording.demonstrations]
         ours = {"env_name": recording.env_name, "env_kwargs": recording.env_kwargs, "expert": recording.expert}
         about = {"description": f"Demonstrations of {recording.env_name}, written by hindrl_jax.", _OURS: json.dumps(ours)}
     storage = storage_class.new(data, **spaces, env_spec=spec, jpeg_encoding=jpeg)
     storage.update_metadata(about | {"dataset_id": name, "minari_version": minari.__version__})
     storage.update_episodes(buffers)
     if metadata is not None:
-        storage.update_episode_metadata([_episode_attributes(demo) for demo in recording.demonstrations])
+        storage.update_episode_metadata([source_metadata(demo) for demo in recording.demonstrations])
     minari.MinariDataset(storage)  # it complains of what it could not read back
 
 
@@ -308,63 +239,11 @@ def _spaces(recording: Recording) -> dict[str, Any]:
     from gymnasium import spaces
 
     first = recording.demonstrations[0]
-    arrays = zip(OBSERVATION_KEYS, (first.observations, first.achieved_goals, first.desired_goal), strict=True)
     goals: dict[str, spaces.Space[Any]] = {
-        key: spaces.Box(-np.inf, np.inf, (array.shape[-1],), array.dtype.type if array.dtype.kind == "f" else np.float32) for key, array in arrays
+        key: spaces.Box(-np.inf, np.inf, rows.shape[1:], rows.dtype.type if rows.dtype.kind == "f" else np.float32)
+        for key, rows in first.observed.items()
     }
     return {"observation_space": spaces.Dict(goals), "action_space": spaces.Box(-1.0, 1.0, first.actions.shape[1:], np.float32)}
-
-
-def _buffer(demo: Demonstration) -> Any:
-    """An episode of a recording that is ours."""
-    goals = np.repeat(demo.desired_goal[None], len(demo) + 1, axis=0)
-    terminations = (np.arange(len(demo)) == len(demo) - 1) & demo.terminated
-    return importlib.import_module("minari.data_collector.episode_buffer").EpisodeBuffer(
-        observations=dict(zip(OBSERVATION_KEYS, (demo.observations, demo.achieved_goals, goals), strict=True)),
-        actions=demo.actions,
-        rewards=demo.rewards,
-        terminations=terminations,
-        truncations=_default_truncations(len(demo), demo.terminated),
-        infos=None if demo.states is None else {"state": demo.states},
-    )
-
-
-def _source_buffer(demo: Demonstration, observation_space: Any) -> Any:
-    """An episode of a dataset that was converted from Minari, as it was there."""
-    extras = demo.extras
-    about = json.loads(demo.attributes["minari"])
-
-    def observations(space: Any, path: str) -> Any:
-        if hasattr(space, "spaces"):
-            return {key: observations(below, f"{path}/{key}" if path else key) for key, below in space.spaces.items()}
-        path = path or "observation"
-        along = dict(zip(OBSERVATION_KEYS, (demo.observations, demo.achieved_goals), strict=False))
-        along["desired_goal"] = np.repeat(demo.desired_goal[None], len(demo) + 1, axis=0)
-        return extras.get(MINARI_OBSERVATIONS + path, along.get(path))
-
-    infos: dict[str, Any] = {}
-    for key, rows in extras.items():
-        if key.startswith(_INFOS):
-            *groups, leaf = key.removeprefix(_INFOS).split("/")
-            place = infos
-            for group in groups:
-                place = place.setdefault(group, {})
-            place[leaf] = rows.astype(str).tolist() if rows.dtype.kind == "S" else rows
-    terminations = extras[_TERMINATIONS]
-    return importlib.import_module("minari.data_collector.episode_buffer").EpisodeBuffer(
-        seed=about.get("seed"),
-        options=about.get("options"),
-        observations=observations(observation_space, ""),
-        actions=extras.get(f"{SOURCE}actions", demo.actions),
-        rewards=extras.get(f"{SOURCE}rewards", demo.rewards),
-        terminations=terminations,
-        truncations=extras.get(_TRUNCATIONS, _default_truncations(len(demo), bool(terminations[-1]))),
-        infos=infos or None,
-    )
-
-
-def _episode_attributes(demo: Demonstration) -> dict[str, Any]:
-    return {key: value for key, value in json.loads(demo.attributes["minari"]).items() if key not in ("seed", "options")}
 
 
 def left_out(recording: Recording) -> list[str]:

@@ -26,7 +26,7 @@ import numpy as np
 from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.base.files import DAMAGED_ARCHIVE, check_is_file, read_arrays
 from hindrl_jax.demonstrations.foreign import ForeignDemonstration, ForeignRecording
-from hindrl_jax.demonstrations.hdf5 import Demonstration, Recording
+from hindrl_jax.demonstrations.recording import Demonstration, Recording
 
 _FORMAT_VERSION = 1
 

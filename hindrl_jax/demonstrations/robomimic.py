@@ -1,8 +1,8 @@
 """HDF5 files of robomimic and robosuite.
 
-robomimic's files have the layout of ours (see `hindrl_jax.demonstrations.hdf5`) with modalities of their own in place of observation and goals: `obs/KEY`, and
-`next_obs/KEY` unless they were left out. `mask/KEY` lists the demonstrations of a filter key. robosuite's own files (`demo.hdf5` of its
-collect_human_demonstrations) have states and actions only; robomimic's dataset_states_to_obs makes observations of the states.
+robomimic's files have the layout of ours (see `hindrl_jax.demonstrations.hdf5`) with modalities of their own in place of observation and goals:
+`obs/KEY`, and `next_obs/KEY` unless they were left out. `mask/KEY` lists the demonstrations of a filter key. robosuite's own files (`demo.hdf5` of
+its collect_human_demonstrations) have states and actions only; robomimic's dataset_states_to_obs makes observations of the states.
 
 Our own files are robomimic files as they are. `restored` takes from a converted one what the conversion added.
 """
@@ -10,7 +10,6 @@ Our own files are robomimic files as they are. `restored` takes from a converted
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +17,17 @@ import h5py
 import numpy as np
 
 from hindrl_jax.base.errors import UserError
-from hindrl_jax.base.files import check_is_file
+from hindrl_jax.demonstrations._hdf5_files import datasets_beside, datasets_within, hdf5_bytes, opened
+from hindrl_jax.demonstrations._layout import demonstration_names, joined, layout
 from hindrl_jax.demonstrations.foreign import SOURCE, ForeignDemonstration, ForeignRecording
-from hindrl_jax.demonstrations.hdf5 import Demonstration, Recording, damage_reported, datasets_within, hdf5_bytes, layout
+from hindrl_jax.demonstrations.recording import Demonstration, Recording
 
 _MAX_MODALITY_DIMS = 2  # images have more: they are kept for robomimic, but are no modality of ours
 
 
 def is_ours(path: Path) -> bool:
     """Whether hindrl_jax has written an HDF5 file."""
-    check_is_file(path)
-    with damage_reported(f"{path}", "is not an HDF5 file, or is cut off or damaged"), h5py.File(path, "r", locking="best-effort") as file:
+    with opened(path) as file:
         return isinstance(file.get("data"), h5py.Group) and "format_version" in file["data"].attrs
 
 
@@ -38,16 +37,15 @@ def read(path: Path) -> ForeignRecording:
     Raises:
       UserError: it is missing or damaged, or is no such file.
     """
-    check_is_file(path)
-    with damage_reported(f"{path}", "is not an HDF5 file, or is cut off or damaged"), h5py.File(path, "r", locking="best-effort") as file:
+    with opened(path) as file:
         data = file.get("data")
         if not isinstance(data, h5py.Group):
             raise UserError(f"{path}: has no group 'data', so it is no file of robomimic or robosuite; name a file of demonstrations")
-        names = sorted((name for name in data if re.fullmatch(r"demo_\d+", name)), key=lambda name: int(name.removeprefix("demo_")))
+        names = demonstration_names(data)
         if not names:
             raise UserError(f"{path}: holds no demonstrations; name another file")
         attributes = {name: value for name, value in data.attrs.items() if name != "total"}
-        extras = {name: array for top in file if top != "data" for name, array in _datasets_of(file, top).items()}
+        extras = datasets_beside(file, "data")
         env_args = _env_args(path, attributes)
         return ForeignRecording(
             source=f"{path}",
@@ -59,10 +57,6 @@ def read(path: Path) -> ForeignRecording:
             extras=extras,
             attributes=attributes,
         )
-
-
-def _datasets_of(file: h5py.File, top: str) -> dict[str, np.ndarray]:
-    return datasets_within(file[top], f"{top}/") if isinstance(file[top], h5py.Group) else {}
 
 
 def _env_args(path: Path, attributes: dict[str, Any]) -> dict[str, Any]:
@@ -88,7 +82,7 @@ def _read_demonstration(where: str, name: str, group: h5py.Group) -> ForeignDemo
     for path, rows in datasets.items():
         if path.startswith("obs/") and rows.ndim <= _MAX_MODALITY_DIMS and rows.dtype.kind in "biuf":
             key = path.removeprefix("obs/")
-            modalities[key] = _joined(where, key, rows, datasets.get(f"next_obs/{key}"))
+            modalities[key] = _rows(where, key, rows, datasets.get(f"next_obs/{key}"))
     along = {key: _numbers(where, key, datasets[key], dims=1) if key in datasets else None for key in ("rewards", "dones")}
     return ForeignDemonstration(
         name=name,
@@ -101,7 +95,7 @@ def _read_demonstration(where: str, name: str, group: h5py.Group) -> ForeignDemo
     )
 
 
-def _joined(where: str, key: str, before: np.ndarray, after: np.ndarray | None) -> np.ndarray:
+def _rows(where: str, key: str, before: np.ndarray, after: np.ndarray | None) -> np.ndarray:
     """obs and next_obs as one array along the demonstration; obs alone, if there is no next_obs."""
     before = _numbers(where, f"obs/{key}", before)
     if after is None or not len(before):
@@ -109,11 +103,7 @@ def _joined(where: str, key: str, before: np.ndarray, after: np.ndarray | None) 
     after = _numbers(where, f"next_obs/{key}", after)
     if after.shape != before.shape:
         raise UserError(f"{where}: obs/{key} has shape {before.shape}, but next_obs/{key} {after.shape}; write the file again")
-    misaligned = np.flatnonzero((_as_columns(after)[:-1] != _as_columns(before)[1:]).any(axis=1))
-    if misaligned.size:
-        t = misaligned[0]
-        raise UserError(f"{where}: row {t} of next_obs/{key} is not row {t + 1} of obs/{key}, the rows are misaligned; write the file again")
-    return _as_columns(np.concatenate([before, after[-1:]]))
+    return joined(where, key, _as_columns(before), _as_columns(after), advice="write the file again")
 
 
 def _as_columns(rows: np.ndarray) -> np.ndarray:
@@ -145,18 +135,12 @@ def restored(recording: Recording, where: str) -> bytes:
 
     def write(file: h5py.File) -> None:
         data = file.create_group("data")
-        for name, value in recording.attributes.items():
-            data.attrs[name] = value
-        data.attrs["total"] = sum(map(len, recording.demonstrations))
-        for name, array in recording.extras.items():
-            file[name] = array
+        data.attrs.update(recording.attributes | {"total": sum(map(len, recording.demonstrations))})
+        file.update(recording.extras)
         for demo in recording.demonstrations:
             group = data.create_group(demo.name)
-            for name, array in _source_datasets(demo, source["datasets"]).items():
-                group[name] = array
-            group.attrs["num_samples"] = len(demo)
-            for name, value in demo.attributes.items():
-                group.attrs[name] = value
+            group.update(_source_datasets(demo, source["datasets"]))
+            group.attrs.update({"num_samples": len(demo)} | demo.attributes)
 
     return hdf5_bytes(write).getvalue()
 
