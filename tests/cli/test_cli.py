@@ -345,7 +345,7 @@ def test_demonstrations_longer_than_the_horizon_are_dropped_with_a_warning(demos
 
 
 def test_demos_plot_draws_what_the_filter_keeps(demos_file, capsys):
-    cli.main(["demos", "plot", str(demos_file), "--m", "0", "--demo", "1"])
+    cli.main(["demos", "plot", str(demos_file), "--epsilon-steps", "0", "--demo", "1"])
     with Image.open(demos_file.with_suffix(".png")) as picture:
         assert picture.size[0] > picture.size[1] > 300
     kept, total = map(int, re.search(r"keeps (\d+) of (\d+) goals", capsys.readouterr().out).groups())
@@ -355,13 +355,13 @@ def test_demos_plot_draws_what_the_filter_keeps(demos_file, capsys):
     goals = np.concatenate([observations, final])
     assert total == len(goals)
     assert kept == 1 + (goals[1:] != goals[:-1]).any(axis=1).sum()  # epsilon is 0: only repeated states are dropped
-    for arguments in (["--demo", "2"], ["--m", "-1"], ["--dims", "0", "0"], ["--dims", "0", "99"], ["--to", "picture.gif"]):
+    for arguments in (["--demo", "2"], ["--epsilon-steps", "-1"], ["--dims", "0", "0"], ["--dims", "0", "99"], ["--to", "picture.gif"]):
         assert arguments[-1] in refusal(capsys, "demos", "plot", demos_file, *arguments)
 
 
 def test_demos_info_and_render(demos_file, tmp_path, capsys):
     capsys.readouterr()
-    cli.main(["demos", "info", str(demos_file), "--m", "5"])
+    cli.main(["demos", "info", str(demos_file), "--epsilon-steps", "5"])
     printed = capsys.readouterr().out
     assert "2 demonstrations, 2 solved" in printed
     cli.main(["demos", "render", str(demos_file), "--demo", "1", "--to", str(tmp_path / "demo.png")])

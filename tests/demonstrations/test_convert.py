@@ -62,13 +62,13 @@ def test_info_and_plot_of_foreign_files(recorded, tmp_path, capsys, monkeypatch)
         "--observation-keys",
     ):
         assert words in printed
-    cli.main(["demos", "info", str(ROBOMIMIC_FILE), "--observation-keys", *KEYS, "--m", "5"])
+    cli.main(["demos", "info", str(ROBOMIMIC_FILE), "--observation-keys", *KEYS, "--epsilon-steps", "5"])
     assert "2 demonstrations, 2 solved, 112 transitions" in capsys.readouterr().out
     write("minari:group/grid-v0", read_recording(recorded))
     keeps = []
     for source in (str(recorded), "minari:group/grid-v0"):
-        cli.main(["demos", "info", source, "--m", "3"])
+        cli.main(["demos", "info", source, "--epsilon-steps", "3"])
         keeps.append(next(line for line in capsys.readouterr().out.splitlines() if line.startswith("the filter keeps")))
     assert keeps[0] == keeps[1]
-    cli.main(["demos", "plot", "minari:group/grid-v0", "--m", "3"])
+    cli.main(["demos", "plot", "minari:group/grid-v0", "--epsilon-steps", "3"])
     assert (tmp_path / "grid-v0.png").read_bytes().startswith(b"\x89PNG")

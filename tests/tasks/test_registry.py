@@ -43,7 +43,7 @@ def test_task_of_ones_own_by_the_commands(forget, tmp_path, capsys):
     file = tmp_path / "demos.hdf5"
     cli.main(["demos", "record", "--env", "two_rooms:TwoRooms", "--demos", "3", "--noise", "0.3", "--out", str(file)])
     forget()
-    cli.main(["demos", "info", str(file), "--m", "3"])
+    cli.main(["demos", "info", str(file), "--epsilon-steps", "3"])
     assert "two_rooms:TwoRooms(horizon=60" in capsys.readouterr().out
     forget()
     arguments = ["--env", "two_rooms:TwoRooms", "--preset", "original", "--gate-width", "0.2", "--demos", str(file)]
