@@ -21,19 +21,9 @@ from hindrl_jax.base.files import check_can_write, disk_trouble
 from hindrl_jax.base.types import Episodes
 from hindrl_jax.cli.common import ENV_HELP, console, counted, env_names, episode_key, parse, peek
 from hindrl_jax.core.goals import epsilon_filter, epsilon_from_demonstrations, is_visited
-from hindrl_jax.demonstrations.convert import (
-    MINARI_PREFIX,
-    ForeignRecording,
-    Interpretation,
-    check_target,
-    left_out,
-    open_source,
-    read,
-    restore,
-    understand,
-    write,
-)
+from hindrl_jax.demonstrations.convert import MINARI_PREFIX, check_target, left_out, open_source, read, restore, understand, write
 from hindrl_jax.demonstrations.episodes import padded
+from hindrl_jax.demonstrations.foreign import ForeignRecording, Interpretation
 from hindrl_jax.demonstrations.hdf5 import save_demonstrations
 from hindrl_jax.demonstrations.recording import Recording, summarise_recording
 from hindrl_jax.experts.by_hand import record_by_hand

@@ -16,26 +16,11 @@ from hindrl_jax.base.files import check_can_write, write_atomically
 from hindrl_jax.base.types import Episodes
 from hindrl_jax.demonstrations import minari, npz, robomimic
 from hindrl_jax.demonstrations.episodes import as_episodes
-from hindrl_jax.demonstrations.foreign import ForeignRecording, Interpretation, Solved
+from hindrl_jax.demonstrations.foreign import ForeignRecording, Interpretation
 from hindrl_jax.demonstrations.hdf5 import check_recording, load_demonstrations, read_recording, write_recording
 from hindrl_jax.demonstrations.interpret import interpret
 from hindrl_jax.demonstrations.recording import Recording
 from hindrl_jax.tasks.registry import TASKS, make
-
-__all__ = [
-    "MINARI_PREFIX",
-    "ForeignRecording",
-    "Interpretation",
-    "Solved",
-    "check_target",
-    "left_out",
-    "load",
-    "open_source",
-    "read",
-    "restore",
-    "understand",
-    "write",
-]
 
 _HDF5 = (".hdf5", ".h5")
 _NPZ = ".npz"

@@ -14,7 +14,7 @@ import pytest
 
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Episodes
-from hindrl_jax.demonstrations.convert import Interpretation
+from hindrl_jax.demonstrations.foreign import Interpretation
 
 ROBOMIMIC_FILE = Path(__file__).parent.parent / "data" / "robomimic_low_dim.hdf5"
 KEYS = ("objects", "goal", "delivered", "held")  # in this order they are the observation of the grid tasks

@@ -9,7 +9,8 @@ import pytest
 from foreign_files import KEYS, MEANING, ROBOMIMIC_FILE, change, refusal, remove_next_obs, with_entry
 
 from hindrl_jax.base.errors import UserError
-from hindrl_jax.demonstrations.convert import Interpretation, read
+from hindrl_jax.demonstrations.convert import read
+from hindrl_jax.demonstrations.foreign import Interpretation
 
 
 def test_filter_key(tmp_path):

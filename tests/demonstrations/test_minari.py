@@ -17,7 +17,8 @@ from foreign_files import TINY, refusal
 from hindrl_jax import cli
 from hindrl_jax.base.environments import action_to_env
 from hindrl_jax.base.errors import UserError
-from hindrl_jax.demonstrations.convert import Interpretation, read, write
+from hindrl_jax.demonstrations.convert import read, write
+from hindrl_jax.demonstrations.foreign import Interpretation
 from hindrl_jax.demonstrations.hdf5 import read_recording
 from hindrl_jax.tasks.registry import make
 

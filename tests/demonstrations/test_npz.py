@@ -7,7 +7,8 @@ import pytest
 from foreign_files import archive, refusal
 
 from hindrl_jax.base.errors import UserError
-from hindrl_jax.demonstrations.convert import Interpretation, read, write
+from hindrl_jax.demonstrations.convert import read, write
+from hindrl_jax.demonstrations.foreign import Interpretation
 from hindrl_jax.demonstrations.hdf5 import read_recording
 
 

@@ -9,7 +9,8 @@ import numpy as np
 from foreign_files import KEYS, MEANING, ROBOMIMIC_FILE, TINY, assert_same_file, refusal
 
 from hindrl_jax import cli
-from hindrl_jax.demonstrations.convert import Interpretation, load, read, restore, write
+from hindrl_jax.demonstrations.convert import load, read, restore, write
+from hindrl_jax.demonstrations.foreign import Interpretation
 from hindrl_jax.demonstrations.hdf5 import load_demonstrations, read_recording
 
 
