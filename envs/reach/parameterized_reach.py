@@ -11,7 +11,7 @@ Differences from the thesis:
   * Commanded rotations are about the base's axes, as in robosuite's controller; the text has them relative to the hand's orientation.
   * The random task observes the waypoints, as the thesis says it must: for each, the displacement and the rotation that remain, the one whose turn
     it is first. Its achieved goal is the displacement and rotation that remain to the last waypoint, and the mask, so that equal goals mean the same
-    in every episode. In hindsight not the goal is changed but the waypoints (`ParameterizedReach.retell`).
+    in every episode. Hindsight rewrites the waypoints in the observations instead of the goal (`ParameterizedReach.relabel_observations`).
 """
 
 from __future__ import annotations
@@ -355,33 +355,34 @@ class ParameterizedReach(_Reach):
         """One for each waypoint."""
         return self.num_waypoints
 
-    def retell(self, key: Array, observations: Array, subgoals: Array) -> tuple[Array, Array]:
-        """The same motion of the arm, told as though the waypoints had been where the hand was in other states.
+    def relabel_observations(self, key: Array, observations: Array, subgoals: Array) -> tuple[Array, Array]:
+        """What would have been observed if the waypoints that remain had been where the hand was in other states.
 
-        The waypoints do not move the arm, so this is just what would have been observed. How many of them had been reached when the story begins is
-        either as it was or drawn anew, with equal chances: else nothing would be told about the later ones before the first has been found.
+        The waypoints do not affect the motion of the arm, so this is exact. How many waypoints have been reached at the beginning is as recorded or
+        drawn uniformly, with equal chances. Without the draws, no row could be about a later waypoint before the policy has found the first.
 
         Args:
           key: random key.
-          observations: (n + 1, D) of states that follow each other, the task not solved in the first.
-          subgoals: (K, D) observations of the states whose poses become the waypoints that remain, in their order; more than remain are left out.
+          observations: (n + 1, D) of consecutive states, the task not solved in the first.
+          subgoals: (K, D) observations of the states whose poses become the remaining waypoints, in the order in which these are to be reached. If
+            only r waypoints remain, the first r are used.
 
         Returns:
-          The observations anew, and (n,) bool for each but the first, whether the task is solved there.
+          The relabelled observations (n + 1, D), and (n,) bool for each but the first, whether the task is solved there.
         """
-        key_lived, key_count = jax.random.split(key)
+        key_choice, key_count = jax.random.split(key)
         poses, masks, remaining = self._parts(observations)
         positions, matrices = jax.vmap(self._from_pose)(poses)
-        lived = jnp.sum(masks[0]).astype(jnp.int32)
+        recorded = jnp.sum(masks[0]).astype(jnp.int32)
         drawn = jax.random.randint(key_count, (), 0, self.num_waypoints)
-        count = jnp.where(jax.random.bernoulli(key_lived), lived, drawn)
+        count = jnp.where(jax.random.bernoulli(key_choice), recorded, drawn)
 
-        displacements, turns = jnp.split(jnp.roll(remaining[0], lived, axis=0), 2, axis=-1)
+        displacements, turns = jnp.split(jnp.roll(remaining[0], recorded, axis=0), 2, axis=-1)
         old_positions = positions[:1] + displacements
         old_matrices = jnp.sum(jax.vmap(rotations.from_rotation_vector)(turns)[:, :, :, None] * matrices[0][None, None], axis=2)
         new_positions, new_matrices = jax.vmap(self._from_pose)(self._parts(jnp.roll(subgoals, count, axis=0))[0])
-        remains = jnp.arange(self.num_waypoints) >= count
-        waypoints = jnp.where(remains[:, None], new_positions, old_positions), jnp.where(remains[:, None, None], new_matrices, old_matrices)
+        moved = jnp.arange(self.num_waypoints) >= count
+        waypoints = jnp.where(moved[:, None], new_positions, old_positions), jnp.where(moved[:, None, None], new_matrices, old_matrices)
 
         remaining = jax.vmap(_remaining, (0, 0, None, None))(positions, matrices, *waypoints)  # (n + 1, K, 6)
         within = jax.vmap(jax.vmap(self._is_within, (None, None, 0, 0)), (0, 0, None, None))(positions, matrices, *waypoints)  # (n + 1, K)

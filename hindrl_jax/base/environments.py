@@ -86,24 +86,26 @@ class RestorableEnvironment(Environment, Protocol):
 
 
 @runtime_checkable
-class RetellableEnvironment(Environment, Protocol):
-    """An environment whose observations say what an episode is about, and whose motion does not depend on that: what has happened can be told
-    again as though the episode had been about something else. Hindsight then changes observations in place of goals."""
+class RelabelsObservations(Environment, Protocol):
+    """An environment whose task has parameters, such as where the waypoints are, that hindsight can replace.
+
+    The task's parameters are part of the observation and do not affect the dynamics, so hindsight rewrites observations instead of goals.
+    """
 
     @property
     def num_subgoals(self) -> int:
-        """J, how many states one story is about."""
+        """J, how many states the parameters are made of: for example one for each waypoint."""
 
-    def retell(self, key: Array, observations: Array, subgoals: Array) -> tuple[Array, Array]:
-        """What would have been seen, had the episode been about other states.
+    def relabel_observations(self, key: Array, observations: Array, subgoals: Array) -> tuple[Array, Array]:
+        """What would have been observed in the same states if the task had had other parameters.
 
         Args:
           key: random key.
-          observations: (n + 1, D) of states that follow each other, the task not solved in the first.
-          subgoals: (J, D) observations of the states that it is now about, in the order in which they are to be reached.
+          observations: (n + 1, D) of consecutive states, the task not solved in the first.
+          subgoals: (J, D) observations of the states that the new parameters are made of, in the order in which they are to be reached.
 
         Returns:
-          The observations anew, and (n,) bool for each but the first, whether the task is solved there.
+          The relabelled observations (n + 1, D), and (n,) bool for each but the first, whether the task is solved there.
         """
 
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hindrl_jax.base.environments import Environment, RetellableEnvironment
+from hindrl_jax.base.environments import Environment, RelabelsObservations
 from hindrl_jax.base.types import Array, Episodes, Transition, tree_where
 from hindrl_jax.config import BatchConfig, TrainConfig
 from hindrl_jax.core.goals import GoalTest
@@ -79,12 +79,12 @@ def sample_batch(key: Array, replay: ReplayState, guidance: Guidance, env_steps:
 
 
 def rows_of_replay(key: Array, replay: ReplayState, rows: Rows, guidance: Guidance, env: Environment, config: TrainConfig) -> Transition:
-    """Reads B rows of the replay, and relabels those that are to be: their goals or, in a `RetellableEnvironment`, their observations."""
+    """Reads B rows of the replay, and relabels those that are to be: their goals, or their observations (`RelabelsObservations`)."""
     steps = read_steps(replay.episodes, rows.row, rows.step, config.batch.n_step)
     test = goal_test(guidance, env, config)
     if config.batch.sources:
         source = goal_source(guidance.goals, config.batch)
-        if isinstance(env, RetellableEnvironment):
+        if isinstance(env, RelabelsObservations):
             steps = relabel_observations(key, replay, steps, rows.relabelled, source, env)
         else:
             steps = relabel(key, replay, steps, rows.relabelled, source, test)

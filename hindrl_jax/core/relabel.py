@@ -12,7 +12,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from hindrl_jax.base.environments import RetellableEnvironment
+from hindrl_jax.base.environments import RelabelsObservations
 from hindrl_jax.base.types import Array
 from hindrl_jax.core.goals import GoalTest
 from hindrl_jax.core.hindsight import GoalSource
@@ -53,7 +53,7 @@ def reward_by_goal(steps: Steps, chosen: Array, test: GoalTest) -> Steps:
     )
 
 
-def relabel_observations(key: Array, replay: ReplayState, steps: Steps, chosen: Array, source: GoalSource, env: RetellableEnvironment) -> Steps:
+def relabel_observations(key: Array, replay: ReplayState, steps: Steps, chosen: Array, source: GoalSource, env: RelabelsObservations) -> Steps:
     """Rewrites what rows observe, as if the episode had been about other states, and rewards them where the task is then solved.
 
     They end there whatever the goal test says: no row begins in a solved state, so the value of one is never learnt.
@@ -72,7 +72,7 @@ def relabel_observations(key: Array, replay: ReplayState, steps: Steps, chosen: 
     rows, first_steps = (jnp.broadcast_to(index[:, None], (num_rows, env.num_subgoals)) for index in (steps.row, steps.step))
     subgoals, _ = source(key_source, replay, rows, first_steps)
     recorded = jnp.concatenate([steps.observation[:, None], steps.next_observations], axis=1)
-    observations, solved = jax.vmap(env.retell)(keys, recorded, subgoals)
+    observations, solved = jax.vmap(env.relabel_observations)(keys, recorded, subgoals)
     solved &= chosen[:, None]
     return steps.replace(
         observation=jnp.where(chosen[:, None], observations[:, 0], steps.observation),

@@ -5,7 +5,8 @@
     original   the same, with the quirks of the original implementation that explain its published figures
 
 Each has settings for the grid worlds and others for the reach tasks, as the thesis's appendix does. Beside them the default has a recipe for HinDRL
-in tasks that are told anew in hindsight (`types.RetellableEnvironment`), such as ParameterizedReach. Environments of Gymnasium have the default only.
+in tasks whose observations hindsight relabels (`environments.RelabelsObservations`), such as ParameterizedReach. Environments of Gymnasium have the
+default only.
 """
 
 from __future__ import annotations
@@ -45,8 +46,8 @@ def preset(algo: Algorithm = "hindrl", name: Preset = "default", *, env: str | E
         if name != "default":
             raise UserError(f"the preset {name} is for the thesis's tasks: choose default for environments of Gymnasium")
         return _as_algorithm(_gymnasium(algo, make(env) if isinstance(env, str) else env), algo)
-    if name == "default" and algo in ("hindrl", "smooth-hindrl") and hasattr(known_task.environment, "retell"):
-        return _as_algorithm(_retold(), algo)
+    if name == "default" and algo in ("hindrl", "smooth-hindrl") and hasattr(known_task.environment, "relabel_observations"):
+        return _as_algorithm(_observation_relabelling(), algo)
     return _as_algorithm({"default": _default, "thesis": _thesis, "original": _original}[name](algo, family), algo)
 
 
@@ -103,8 +104,8 @@ def _default(algo: Algorithm, family: Family) -> TrainConfig:
     )
 
 
-def _retold() -> TrainConfig:
-    """The recipe for a `types.RetellableEnvironment`: four rows told anew for each one as it was lived, and few demonstration rows."""
+def _observation_relabelling() -> TrainConfig:
+    """The recipe for `environments.RelabelsObservations`: four relabelled rows for each original one, and few demonstration rows."""
     return TrainConfig(
         steps=100_000,
         num_envs=16,

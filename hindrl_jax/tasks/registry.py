@@ -71,7 +71,7 @@ def register(environment: type[Any], *, expert: type[Any] | None = None, viewer:
       viewer: an object or module, or the name of a module, with save_png(env, state, path) and animation(env, states, captions=None), which returns
         pictures (H, W, 3) uint8 and the seconds that each is shown; None for no films.
       family: which of the presets' recipes to begin with: "grid" for tasks of tens of steps, "reach" for hundreds of small ones. HinDRL in an
-        environment with `retell` begins with the recipe of ParameterizedReach.
+        environment with `relabel_observations` begins with the recipe of ParameterizedReach.
       summary: one line for `hindrl envs`.
 
     Raises:
@@ -95,8 +95,10 @@ def register(environment: type[Any], *, expert: type[Any] | None = None, viewer:
         raise UserError(
             f"{name} lacks {', '.join(missing)}: see hindrl_jax.base.environments.RestorableEnvironment for what an environment must have"
         )
-    if hasattr(environment, "retell") != hasattr(environment, "num_subgoals"):
-        raise UserError(f"{name} has one of retell and num_subgoals: give it both or neither, see hindrl_jax.base.environments.RetellableEnvironment")
+    if hasattr(environment, "relabel_observations") != hasattr(environment, "num_subgoals"):
+        raise UserError(
+            f"{name} has one of relabel_observations and num_subgoals: give it both or neither, see hindrl_jax.base.environments.RelabelsObservations"
+        )
     if expert is not None and not hasattr(expert, "act"):
         raise UserError(f"{expert.__name__} lacks act(key, env, state), the action that the expert takes")
     TASKS[name] = Task(environment, expert, viewer, family, summary)

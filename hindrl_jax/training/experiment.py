@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from hindrl_jax.base.environments import RestorableEnvironment, RetellableEnvironment, compiler_options
+from hindrl_jax.base.environments import RelabelsObservations, RestorableEnvironment, compiler_options
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Array, Episodes
 from hindrl_jax.config import SWEEPABLE, TrainConfig, sweepable_value, with_traced_values
@@ -198,7 +198,7 @@ def check_config(env: RestorableEnvironment, config: TrainConfig) -> None:
             raise UserError(
                 f"behavioural_goals = environment is for Gymnasium's environments: {env.name} gives its episodes no goals; choose another"
             )
-        if isinstance(env, RetellableEnvironment):
+        if isinstance(env, RelabelsObservations):
             if config.batch.uses_intersections:
                 raise UserError(
                     f"joint_intersection compares goals, and hindsight changes none in {env.name}: choose another hindrl_sampling_strategy"

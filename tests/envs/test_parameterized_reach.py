@@ -12,6 +12,7 @@ import pytest
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from hindrl_jax.base.environments import RelabelsObservations
 from hindrl_jax.envs.reach import FixedParameterizedReach, ParameterizedReach, ReachState, panda, rotations
 
 BOTH_TASKS = pytest.mark.parametrize("task", [FixedParameterizedReach, ParameterizedReach])
@@ -336,8 +337,13 @@ def test_goals_of_many_observations_at_once():
 # --- hindsight
 
 
+def test_only_the_random_task_relabels_observations():
+    assert isinstance(ParameterizedReach(), RelabelsObservations)
+    assert not isinstance(FixedParameterizedReach(), RelabelsObservations)
+
+
 @pytest.mark.parametrize("arguments", [{}, {"num_waypoints": 3}, {"orientation": "axis_angle", "rotation_test": "axis_angle"}])
-def test_a_story_told_anew_is_what_would_have_been_observed(arguments):
+def test_relabelled_observations_are_what_would_have_been_observed(arguments):
     env = ParameterizedReach(**arguments)
     count, num_steps, starts = env.num_waypoints, 4, (0, 5, 11)
     joints = np.array(panda.INITIAL_JOINTS) + np.cumsum(np.random.default_rng(0).normal(0.004, 0.006, (30, 7)), axis=0)
@@ -345,29 +351,31 @@ def test_a_story_told_anew_is_what_would_have_been_observed(arguments):
         np.linspace((0.1, 0.0, 0.1), (-0.1, 0.2, 0.0), count), np.linspace((0.3, 0, 0), (0, 0, 0.2), count), joints=joints[0], num_reached=1
     )
     look = jax.jit(jax.vmap(lambda q, reached: env.observe(state.replace(joints=q, num_reached=reached))))
-    observations = look(jnp.asarray(joints, jnp.float32), jnp.asarray(np.arange(30) >= 8, jnp.int32))  # lived, a waypoint is reached on the way
-    retell, arrive = jax.jit(env.retell), jax.jit(env.arrive)
-    told_counts, solved_at_all = set(), []
+    # As recorded, a waypoint is reached on the way.
+    observations = look(jnp.asarray(joints, jnp.float32), jnp.asarray(np.arange(30) >= 8, jnp.int32))
+    relabel, arrive = jax.jit(env.relabel_observations), jax.jit(env.arrive)
+    reached_at_first, solved_at_all = set(), []
     for seed in range(12):
         start = starts[seed % 3]
         chosen = [start + 2, start + 3, start + 3 + seed][:count] if count == 3 else [start + 1 + seed % 3, start + 3]
-        told, solved = retell(jax.random.key(seed), observations[start : start + num_steps + 1], observations[np.array(chosen)])
-        mask = told[0, env.pose_dim : env.pose_dim + count]
+        relabelled, solved = relabel(jax.random.key(seed), observations[start : start + num_steps + 1], observations[np.array(chosen)])
+        mask = relabelled[0, env.pose_dim : env.pose_dim + count]
         reached = int(mask.sum())
+        # The same motion, played with the waypoints where they now are.
         poses = [mujoco_hand(joints[index]) for index in chosen[: count - reached]]
-        lived = state.replace(joints=jnp.asarray(joints[start], jnp.float32), num_reached=jnp.asarray(reached))
-        lived = lived.replace(
-            positions=lived.positions.at[reached:].set(jnp.array([position for position, _ in poses])),
-            rotations=lived.rotations.at[reached:].set(jnp.array([matrix for _, matrix in poses])),
+        played = state.replace(joints=jnp.asarray(joints[start], jnp.float32), num_reached=jnp.asarray(reached))
+        played = played.replace(
+            positions=played.positions.at[reached:].set(jnp.array([position for position, _ in poses])),
+            rotations=played.rotations.at[reached:].set(jnp.array([matrix for _, matrix in poses])),
         )
-        np.testing.assert_allclose(told[0], observe(env, lived), atol=2e-5)
+        np.testing.assert_allclose(relabelled[0], observe(env, played), atol=2e-5)
         for index in range(1, num_steps + 1):
-            lived, time_step = arrive(lived, jnp.asarray(joints[start + index], jnp.float32), lived.velocities)
-            np.testing.assert_allclose(told[index], time_step.observation, atol=2e-5)
-            assert solved[index - 1] == env.is_solved(lived)
-        told_counts.add(reached)
+            played, time_step = arrive(played, jnp.asarray(joints[start + index], jnp.float32), played.velocities)
+            np.testing.assert_allclose(relabelled[index], time_step.observation, atol=2e-5)
+            assert solved[index - 1] == env.is_solved(played)
+        reached_at_first.add(reached)
         solved_at_all.append(bool(solved[-1]))
-    assert told_counts == set(range(count))
+    assert reached_at_first == set(range(count))
     assert sum(solved_at_all) > 0
 
 

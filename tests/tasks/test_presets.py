@@ -107,12 +107,12 @@ def test_original_preset_differs_from_the_thesis_by_the_quirks_alone(env, more):
 def test_default_recipes_differ_by_family_and_the_grid_has_the_defaults_of_the_config():
     second_life = dataclasses.replace(TrainConfig(), steps=240_000, agent_resets=(1 / 3,))
     assert preset("hindrl", env="GridPickAndPlace") == preset("hindrl") == second_life
-    fixed, retold = preset("hindrl", env="FixedParameterizedReach"), preset("hindrl", env="ParameterizedReach")
-    assert preset("hindrl", env=make("ParameterizedReach", num_waypoints=1)) == retold
-    assert len({TrainConfig(), fixed, retold}) == 3  # what has happened is told anew there, in part about demonstrated states
-    assert retold.batch.hindrl_sampling_strategy == "joint_union"
+    fixed, relabelling = preset("hindrl", env="FixedParameterizedReach"), preset("hindrl", env="ParameterizedReach")
+    assert preset("hindrl", env=make("ParameterizedReach", num_waypoints=1)) == relabelling
+    assert len({TrainConfig(), fixed, relabelling}) == 3  # observations are relabelled there, in part with demonstrated states
+    assert relabelling.batch.hindrl_sampling_strategy == "joint_union"
     assert preset("bc", env="ParameterizedReach") == preset("bc", env="FixedParameterizedReach")
-    assert retold.demo_reset_ratio > 0.0
+    assert relabelling.demo_reset_ratio > 0.0
     assert preset("tqcfd", env="ParameterizedReach") == preset("tqcfd", env="FixedParameterizedReach")
     assert preset("tqcfd", env="ParameterizedReach").batch.relabelled_per_original == 0.0
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
@@ -15,6 +16,7 @@ import hindrl_jax as hindrl
 from hindrl_jax import cli
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.cli.training import parse_train
+from hindrl_jax.envs.grid import FixedGridPickAndPlace
 from hindrl_jax.runs.reader import draw_episodes
 from hindrl_jax.runs.spec import read_spec
 from hindrl_jax.runs.writer import RunWriter
@@ -125,6 +127,14 @@ class Demanding:
     name: ClassVar[str] = "Demanding"
 
 
+@dataclasses.dataclass(frozen=True)
+class Half(FixedGridPickAndPlace):
+    name: ClassVar[str] = "Half"
+
+    def relabel_observations(self, key, observations, subgoals):
+        return observations, jnp.zeros(len(observations) - 1, bool)
+
+
 class Plain:
     name = "Plain"
 
@@ -136,6 +146,7 @@ class Plain:
         (Empty, "Empty lacks observation_dim, goal_dim"),
         (Taken, "is the name of one of this project's own tasks"),
         (Demanding, "Demanding has no default for size"),
+        (Half, "Half has one of relabel_observations and num_subgoals: give it both or neither, see .*RelabelsObservations"),
         (Plain, "must be a class with @dataclasses.dataclass"),
         (Empty(), "must be a class with"),
     ],
