@@ -1,4 +1,4 @@
-"""A task of your own: out of the left room through a gate that is elsewhere in every episode, to a target in the right room.
+"""A task of your own: from the left room to a target in the right room, through a gate whose height differs from episode to episode.
 
 hindrl train --env two_rooms:TwoRooms --demos 3 --epsilon-steps 3 --demo-reset-ratio 0.5 --steps 40000
 """
@@ -16,7 +16,7 @@ from hindrl_jax.base.types import TimeStep
 
 @struct.dataclass(kw_only=True)
 class RoomsState:
-    key: jax.Array  # () random key, constant within an episode
+    key: jax.Array  # () typed random key, constant within an episode
     position: jax.Array  # (2,) in the unit square; the wall between the rooms is at x = 0.5
     gate: jax.Array  # () height of the gate in that wall
     step: jax.Array  # () int32, steps taken
@@ -24,6 +24,8 @@ class RoomsState:
 
 @dataclasses.dataclass(frozen=True)
 class TwoRooms:
+    """The square is [0, 1] x [0, 1]. An observation is the position (2,) and the height of the gate; a goal is a position (2,)."""
+
     name: ClassVar[str] = "TwoRooms"
     observation_dim: ClassVar[int] = 3
     goal_dim: ClassVar[int] = 2
@@ -58,7 +60,7 @@ class TwoRooms:
         return jnp.append(state.position, state.gate)
 
     def achieved_goal(self, observation):
-        return observation[..., :2]  # where one is
+        return observation[..., :2]  # the position
 
     def task_goal(self):
         return jnp.array([0.9, 0.9])
@@ -72,6 +74,8 @@ class TwoRooms:
 
 @dataclasses.dataclass(frozen=True)
 class RoomsExpert:
+    """Straight to the gate, through it, and to the target; with noise on every step."""
+
     noise: float = 0.5
     """Standard deviation of the noise on its steps, as a share of the longest step."""
 
