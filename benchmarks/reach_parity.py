@@ -13,7 +13,9 @@ from benchmarks import report
 from benchmarks.timing import Options, Row, rounded
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Array
-from hindrl_jax.envs.reach import FixedParameterizedReach, mjx_dynamics, panda, rotations
+from hindrl_jax.envs import panda, rotations
+from hindrl_jax.envs.panda import closed_form, mjx_dynamics
+from hindrl_jax.envs.reach import FixedParameterizedReach
 from hindrl_jax.experts.reach import ReachExpert
 from hindrl_jax.experts.robosuite_arm import RobosuiteArm
 
@@ -46,11 +48,11 @@ def run(options: Options) -> list[Row]:
     except UserError as error:
         print(f"  left out: {error}", flush=True)
         return []
-    closed_form, mjx = FixedParameterizedReach(), FixedParameterizedReach(backend="mjx")
-    starts, commands = sequences(jax.random.key(0), closed_form, num_starts, num_steps)
+    env, env_on_mjx = FixedParameterizedReach(), FixedParameterizedReach(backend="mjx")
+    starts, commands = sequences(jax.random.key(0), env, num_starts, num_steps)
     joints = {
-        "closed_form": simulate(panda.control_step, starts, commands, closed_form.compiler_options),
-        "mjx": simulate(mjx_dynamics.control_step, starts, commands, mjx.compiler_options),
+        "closed_form": simulate(closed_form.control_step, starts, commands, env.compiler_options),
+        "mjx": simulate(mjx_dynamics.control_step, starts, commands, env_on_mjx.compiler_options),
         "robosuite": simulate_in_robosuite(arm, starts, commands),
     }
     arm.close()

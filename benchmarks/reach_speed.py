@@ -19,12 +19,14 @@ from benchmarks.environments import stepper
 from benchmarks.timing import Contestant, Options, Row
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Array
-from hindrl_jax.envs.reach import FixedParameterizedReach, mjx_dynamics, panda
+from hindrl_jax.envs import panda
+from hindrl_jax.envs.panda import closed_form, mjx_dynamics
+from hindrl_jax.envs.reach import FixedParameterizedReach
 from hindrl_jax.experts.robosuite_arm import RobosuiteArm
 
 TITLE = "Reaching, control steps"
 WHO = {
-    "closed_form": "`panda.control_step`: inverse kinematics, controller and arm in closed form",
+    "closed_form": "`closed_form.control_step`: inverse kinematics, controller and arm in closed form",
     "environment": "`FixedParameterizedReach` in closed form, the whole step: with waypoints, observations, rewards and resets, as in training",
     "mjx": "`mjx_dynamics.control_step`: the same inverse kinematics, then controller and arm in 25 steps of MJX",
     "mujoco": "C MuJoCo, `mujoco.rollout`: 25 physics steps towards constant joint targets. It runs no controller: physics alone",
@@ -36,7 +38,7 @@ TURN_SECONDS = 0.3  # of those of the other parts, since there are many contesta
 JOINT_NOISE = FixedParameterizedReach().joint_noise
 
 ControlStep = Callable[[Array, Array, Array, Array], tuple[Array, Array]]
-"""`panda.control_step` or `mjx_dynamics.control_step`."""
+"""`closed_form.control_step` or `mjx_dynamics.control_step`."""
 
 
 def run(options: Options) -> list[Row]:
@@ -44,12 +46,12 @@ def run(options: Options) -> list[Row]:
     print(f"{TITLE}: uniformly random commands, drawn beforehand", flush=True)
     effort = dataclasses.replace(options.effort, turn_seconds=TURN_SECONDS * options.effort.turn_seconds)
     sizes = NUM_ENVS[1:2] if options.quick else NUM_ENVS
-    closed_form, mjx = FixedParameterizedReach(), FixedParameterizedReach(backend="mjx")
+    env, env_on_mjx = FixedParameterizedReach(), FixedParameterizedReach(backend="mjx")
     compiled: dict[tuple[str, int], Contestant] = {}
     for size in sizes:
-        compiled["mjx", size] = arms(mjx_dynamics.control_step, size, min(8, max(1, 1024 // size)), mjx.compiler_options)
-        compiled["closed_form", size] = arms(panda.control_step, size, min(256, max(16, 4096 // size)), closed_form.compiler_options)
-        compiled["environment", size] = stepper(closed_form, size, resets=True, num_actions=16, steps_per_call=4096)
+        compiled["mjx", size] = arms(mjx_dynamics.control_step, size, min(8, max(1, 1024 // size)), env_on_mjx.compiler_options)
+        compiled["closed_form", size] = arms(closed_form.control_step, size, min(256, max(16, 4096 // size)), env.compiler_options)
+        compiled["environment", size] = stepper(env, size, resets=True, num_actions=16, steps_per_call=4096)
     with ThreadPoolExecutor(options.cores) as pool:  # MJX takes a quarter of a minute to compile, for each number of arms
         list(pool.map(lambda contestant: contestant.turn(1), compiled.values()))
     others = {("mujoco", size): physics(size, min(64, max(4, 1024 // size)), options.cores) for size in sizes}

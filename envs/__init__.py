@@ -1,1 +1,10 @@
-"""Environments: one file or folder each, with state, dynamics and observation; drawing lives in a viewer that the dynamics never import."""
+"""The project's own environments, each in a folder of its own: types, rules and viewer apart, and the physics of the Panda shared.
+
+Public are the four tasks below, the folders' names (`envs.grid`, `envs.reach`, `envs.panda`), `envs.rotations`, and `envs.drawing` with each task's
+`viewer`, which the dynamics never import.
+"""
+
+from hindrl_jax.envs.grid import FixedGridPickAndPlace, GridPickAndPlace
+from hindrl_jax.envs.reach import FixedParameterizedReach, ParameterizedReach
+
+__all__ = ["FixedGridPickAndPlace", "FixedParameterizedReach", "GridPickAndPlace", "ParameterizedReach"]

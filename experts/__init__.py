@@ -1,1 +1,11 @@
-"""Scripted experts that act from the state of an environment (thesis section 4.2)."""
+"""Scripted experts that act from the state of an environment (thesis section 4.2), and robosuite's arm, to play in or to steer by hand.
+
+Public are the experts below, `experts.robosuite_arm`, and `experts.by_hand.record_by_hand`. An expert is a frozen dataclass of its options with a
+method act(key, env, state) -> action, or act(observation, rng) for environments of Gymnasium.
+"""
+
+from hindrl_jax.experts.fetch import FetchPickAndPlaceExpert, FetchReachExpert
+from hindrl_jax.experts.grid import GridExpert
+from hindrl_jax.experts.reach import ReachExpert
+
+__all__ = ["FetchPickAndPlaceExpert", "FetchReachExpert", "GridExpert", "ReachExpert"]

@@ -13,9 +13,9 @@ import numpy as np
 
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Array, Episodes
-from hindrl_jax.envs.reach import panda
-from hindrl_jax.experts.robosuite_arm import DeviceName, ReachEnvironment, RobosuiteArm, open_device, play_episode, stacked
-from hindrl_jax.training.recording import on_host
+from hindrl_jax.envs import panda
+from hindrl_jax.envs.reach import ReachTask
+from hindrl_jax.experts.robosuite_arm import DeviceName, RobosuiteArm, open_device, play_episode, stacked
 
 FULL_TRANSLATION, FULL_ROTATION = 0.05, 0.5  # m and rad that robosuite's default controller makes of a device's 1
 CONTROLS = {
@@ -32,9 +32,7 @@ class _WindowClosed(Exception):
     """The person has had enough."""
 
 
-def record_by_hand(
-    key: Array, env: ReachEnvironment, device: DeviceName, num_demos: int, *, report: Callable[[str], None] = lambda line: None
-) -> Episodes:
+def record_by_hand(key: Array, env: ReachTask, device: DeviceName, num_demos: int, *, report: Callable[[str], None] = lambda line: None) -> Episodes:
     """Records demonstrations that a person plays. Unsolved episodes are discarded.
 
     An episode begins with the first movement, runs at 20 Hz, and ends when the task is solved or the horizon reached: 300 steps are 15 seconds.
@@ -56,7 +54,7 @@ def record_by_hand(
         raise UserError(f"num_demos = {num_demos} is too few: record at least 1 demonstration")
     if device not in get_args(DeviceName):
         raise UserError(f"there is no device {device!r}: choose one of {', '.join(get_args(DeviceName))}")
-    if not on_host(env):
+    if env.backend != "robosuite":
         raise UserError(f"a person steers the arm of robosuite, not that of backend = {env.backend}: use backend = robosuite")
     arm = RobosuiteArm(env.num_waypoints, on_screen=True)
     with contextlib.closing(arm):
@@ -71,7 +69,7 @@ def record_by_hand(
 
 def record_with(
     key: Array,
-    env: ReachEnvironment,
+    env: ReachTask,
     arm: RobosuiteArm,
     device: Any,
     num_demos: int,

@@ -1,7 +1,7 @@
-"""Scripted experts of two Fetch tasks of gymnasium-robotics, so that there is something to learn from.
+"""Scripted experts of two Fetch tasks of gymnasium-robotics. They act from observations, not from states.
 
-They see an observation, not a state: the gripper's position (3), and where there is an object its position (3), the way to it from the gripper (3)
-and the places of the two fingers (2). Actions are displacements of the gripper, 1 being 5 cm, and the opening or closing of the fingers.
+An observation holds the gripper's position (3), and where there is an object its position (3), the displacement to it from the gripper (3) and the
+positions of the two fingers (2). Actions are displacements of the gripper (3), 1 being 5 cm, and the opening or closing of the fingers (1).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _BEHIND = 0.5  # share of a commanded displacement that the arm makes within the
 
 @dataclass(frozen=True)
 class _FetchExpert:
-    """What both have in common."""
+    """What both experts share."""
 
     tasks: ClassVar[str]  # how the ids of its environments begin
 
@@ -31,7 +31,7 @@ class _FetchExpert:
         check(self, noise=(self.noise >= 0.0, "0 or more"))
 
     def _command(self, towards: np.ndarray, fingers: float, rng: np.random.Generator) -> np.ndarray:
-        """The action (4,) that brings the gripper by `towards` (3,), in m; fingers 1 opens, -1 closes."""
+        """The action (4,) that moves the gripper by `towards` (3,), in m; fingers 1 opens, -1 closes."""
         displacement = towards / (_STEP * _BEHIND) + self.noise * rng.standard_normal(3)
         return np.clip(np.append(displacement, fingers), -1.0, 1.0).astype(np.float32)
 
@@ -49,7 +49,7 @@ class FetchReachExpert(_FetchExpert):
 
 @dataclass(frozen=True)
 class FetchPickAndPlaceExpert(_FetchExpert):
-    """Above the object, down to it, grasp, and to the goal. It forgets nothing, as it remembers nothing: what to do follows from what it sees."""
+    """Above the object, down to it, grasp, and to the goal. It has no memory: each action follows from the observation alone."""
 
     tasks: ClassVar[str] = "FetchPickAndPlace"
 

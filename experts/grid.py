@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from hindrl_jax.base.checks import check_types
 from hindrl_jax.base.types import Array
-from hindrl_jax.envs.grid.pick_and_place import FixedGridPickAndPlace, GridPickAndPlace, GridState
+from hindrl_jax.envs.grid import GridState, GridTask
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class GridExpert:
         if not 0.0 <= self.random_action_probability <= 1.0:
             raise ValueError(f"random_action_probability must be in [0, 1], got {self.random_action_probability}.")
 
-    def act(self, key: Array, env: GridPickAndPlace | FixedGridPickAndPlace, state: GridState) -> Array:
+    def act(self, key: Array, env: GridTask, state: GridState) -> Array:
         """Chooses an action from the state.
 
         The movement is uniform over those that bring the agent closer to its target: the next object, or the goal while that object is held or
@@ -64,7 +64,7 @@ class GridExpert:
         return jnp.append(jax.nn.one_hot(movement, 4), grab.astype(jnp.float32))
 
 
-def _object(env: GridPickAndPlace | FixedGridPickAndPlace, state: GridState, index: Array) -> Array:
+def _object(env: GridTask, state: GridState, index: Array) -> Array:
     """(2,) int32 cell of object `index`; elementwise, because gathers are slow under `jax.vmap`."""
     chosen = jnp.arange(env.num_objects) == index
     return jnp.sum(jnp.where(chosen[:, None], state.objects, 0), axis=0, dtype=jnp.int32)

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 
 from hindrl_jax.base.checks import check, check_types
 from hindrl_jax.base.types import Array
-from hindrl_jax.envs.reach import FixedParameterizedReach, ParameterizedReach, ReachState, panda, rotations
+from hindrl_jax.envs import panda, rotations
+from hindrl_jax.envs.reach import ReachState, ReachTask
 
 
 @dataclass(frozen=True)
@@ -23,11 +24,11 @@ class ReachExpert:
         check_types(self)
         check(self, randomness_scale=(self.randomness_scale >= 0.0, "0 or more"))
 
-    def act(self, key: Array, env: FixedParameterizedReach | ParameterizedReach, state: ReachState) -> Array:
+    def act(self, key: Array, env: ReachTask, state: ReachState) -> Array:
         """Chooses an action from the state: (P_next - P) + e, e ~ N(0, randomness_scale) (thesis eq. 4.10).
 
-        Both halves are shortened to what the controller takes, 0.02 m and 0.05 rad, which it would do itself: so the action is the motion, and
-        lies within the action bounds.
+        Both halves are shortened to 0.02 m and 0.05 rad, as the controller would do itself. So the action is the motion that is commanded, and lies
+        within the action bounds.
 
         Args:
           key: random key.

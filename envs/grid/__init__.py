@@ -1,5 +1,10 @@
-"""Grid worlds (thesis section 3.1)."""
+"""Grid worlds: pick up numbered objects and carry them to a goal cell (thesis section 3.1).
 
-from hindrl_jax.envs.grid.pick_and_place import FixedGridPickAndPlace, GridPickAndPlace, GridState
+Public are the two tasks, their common class, their state, and the module `viewer`.
+"""
 
-__all__ = ["FixedGridPickAndPlace", "GridPickAndPlace", "GridState"]
+from hindrl_jax.envs.grid.pick_and_place import FixedGridPickAndPlace, GridPickAndPlace
+from hindrl_jax.envs.grid.rules import GridTask
+from hindrl_jax.envs.grid.types import GridState
+
+__all__ = ["FixedGridPickAndPlace", "GridPickAndPlace", "GridState", "GridTask"]

@@ -1,21 +1,7 @@
-"""The two grid worlds of thesis section 3.1: pick up numbered objects in order and carry each one to the goal cell.
-
-Cells are (x, y) with 0 <= x, y < size. One step does, in this order:
-
-1. Grab. If grab is on (action[4] > 0.5), nothing is held and an undelivered object lies on the agent's cell, the lowest-numbered such object is held.
-2. Move. The largest of action[:4] moves the agent by +x, +y, -x or -y; walls stop it. A held object moves along.
-3. Release. If grab is off and an object was held, it stays on the cell where it was BEFORE the move. If that cell is the goal and the object is the
-   next in order, it is delivered and stays there for good. Otherwise it is teleported.
-4. Check. The task is solved when the last object is held on the goal cell after the move and all others are delivered. Any other object that is
-   held on the goal out of order is teleported at once.
-
-Differences from the thesis: none in the default rules. `strict_order=False` gives the rules that the original code enforced instead: holding the last
-object on the goal wins whatever has been delivered, and out-of-order objects are teleported only when they are released.
-"""
+"""The two grid worlds of thesis section 3.1: where things start, and where teleported objects go. `rules` has all else."""
 
 from __future__ import annotations
 
-import abc
 from dataclasses import dataclass
 from itertools import combinations
 from typing import ClassVar
@@ -23,205 +9,15 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
-from hindrl_jax.base.checks import check_types
-from hindrl_jax.base.types import Array, TimeStep
-
-Box = tuple[tuple[int, int], tuple[int, int]]  # lowest and highest (x, y), both inside the box
-
-
-class GridState(struct.PyTreeNode, kw_only=True):
-    """Everything that the next step depends on."""
-
-    key: Array  # () typed random key, constant within an episode
-    agent: Array  # (2,) int32 cell
-    objects: Array  # (K, 2) int32 cells; a held object is on the agent's cell
-    goal: Array  # (2,) int32 cell
-    num_delivered: Array  # () int32, objects 0 .. num_delivered - 1 are delivered
-    held: Array  # () int32, index of the held object, -1 for none
-    step: Array  # () int32, steps taken in this episode
+from hindrl_jax.base.types import Array
+from hindrl_jax.envs.grid.cells import free_rank, overlap, rank_to_cell
+from hindrl_jax.envs.grid.rules import GridTask
+from hindrl_jax.envs.grid.types import Box
 
 
 @dataclass(frozen=True)
-class _PickAndPlace(abc.ABC):
-    """The rules that both tasks share; they differ in where things start and where teleported objects go."""
-
-    name: ClassVar[str]
-    render_fps: ClassVar[int] = 7
-    """Steps shown per second of a film."""
-
-    size: int = 10
-    """Number of cells along each side of the square grid."""
-    num_objects: int = 2
-    """Number of objects to deliver; the thesis text says 3, its experiments use 2."""
-    horizon: int = 100
-    """Number of steps after which an episode is truncated."""
-    strict_order: bool = True
-    """Enforce the order of the objects at success, as the thesis says; off: holding the last object on the goal always wins."""
-
-    def __post_init__(self):
-        check_types(self)
-        for field in ("size", "num_objects", "horizon"):
-            if getattr(self, field) < 1:
-                raise ValueError(f"{field} must be at least 1, got {getattr(self, field)}.")
-
-    @property
-    def observation_dim(self) -> int:
-        return 4 * self.num_objects + 2
-
-    @property
-    def goal_dim(self) -> int:
-        return self.observation_dim
-
-    @property
-    def action_dim(self) -> int:
-        return 5
-
-    @property
-    def action_low(self) -> float:
-        return 0.0
-
-    @property
-    def action_high(self) -> float:
-        return 1.0
-
-    @property
-    def observation_low(self) -> np.ndarray:
-        """(4K+2,) float32, the least value of each entry of an observation."""
-        return np.concatenate([np.full(2 * self.num_objects + 2, 1 - self.size), np.zeros(2 * self.num_objects)]).astype(np.float32)
-
-    @property
-    def observation_high(self) -> np.ndarray:
-        """(4K+2,) float32, the greatest."""
-        return np.concatenate([np.full(2 * self.num_objects + 2, self.size - 1), np.ones(2 * self.num_objects)]).astype(np.float32)
-
-    @property
-    def goal_tolerance(self) -> np.ndarray | None:
-        """(4K+2,) zeros: a state solves the task where its achieved goal is `task_goal()`. None without `strict_order`, where others do as well."""
-        return np.zeros(self.goal_dim, np.float32) if self.strict_order else None
-
-    @property
-    def state_dim(self) -> int:
-        """Length of `state_to_vector`."""
-        return 2 * self.num_objects + 7
-
-    @property
-    def start_boxes(self) -> tuple[Box, ...]:
-        """The boxes in which the agent, the goal and the objects start, in that order; empty if they start anywhere."""
-        return ()
-
-    def reset(self, key: Array) -> tuple[GridState, Array]:
-        """Starts an episode: key -> (state, observation (4K+2,))."""
-        key_episode, key_start = jax.random.split(key)
-        cells = self._start_cells(jax.random.bits(key_start, (self.num_objects + 2,)))
-        zero = jnp.zeros((), jnp.int32)
-        state = GridState(key=key_episode, agent=cells[0], goal=cells[1], objects=cells[2:], num_delivered=zero, held=zero - 1, step=zero)
-        return state, self.observe(state)
-
-    def step(self, state: GridState, action: Array) -> tuple[GridState, TimeStep]:
-        """Takes one step by the rules in the module docstring.
-
-        Args:
-          state: the state to step from.
-          action: (5,) four movement scores and the grab switch; clipped to [0, 1].
-
-        Returns:
-          The next state, and the time step with the true next observation.
-        """
-        action = jnp.clip(action, self.action_low, self.action_high)
-        grab = action[4] > 0.5
-        index = jnp.arange(self.num_objects)
-
-        in_reach = (index >= state.num_delivered) & _same_cell(state.objects, state.agent[None])
-        found = jnp.min(jnp.where(in_reach, index, self.num_objects))
-        found = jnp.where(found < self.num_objects, found, -1)
-        held = jnp.where(grab, jnp.where(state.held >= 0, state.held, found), -1)
-
-        agent = jnp.clip(state.agent + _direction(action[:4]), 0, self.size - 1)
-        objects = jnp.where((index == held)[:, None], agent[None], state.objects)
-
-        released = ~grab & (state.held >= 0)
-        delivered = released & (state.held == state.num_delivered) & _same_cell(state.agent, state.goal)
-        num_delivered = state.num_delivered + delivered
-
-        rejected = jnp.zeros((), bool)
-        if self.strict_order:
-            rejected = (held >= 0) & (held != num_delivered) & _same_cell(agent, state.goal)
-
-        # At most one object is lost per step: the released one (grab off) or the rejected one (grab on).
-        lost = jnp.where(rejected, held, jnp.where(released & ~delivered, state.held, -1))
-        bits = jax.random.bits(jax.random.fold_in(state.key, state.step))
-        objects = jnp.where((index == lost)[:, None], self._teleport_cell(bits, lost, agent, objects, state.goal)[None], objects)
-        held = jnp.where(rejected, -1, held)
-
-        state = state.replace(agent=agent, objects=objects, num_delivered=num_delivered, held=held, step=state.step + 1)
-        terminated = self.is_solved(state)
-        return state, TimeStep(
-            observation=self.observe(state),
-            reward=terminated.astype(jnp.float32),
-            terminated=terminated,
-            truncated=(state.step >= self.horizon) & ~terminated,
-        )
-
-    def is_solved(self, state: GridState) -> Array:
-        """() bool, whether the last object is held on the goal and, under `strict_order`, all others are delivered."""
-        last = self.num_objects - 1
-        solved = (state.held == last) & _same_cell(state.agent, state.goal)
-        return solved & (state.num_delivered == last) if self.strict_order else solved
-
-    def observe(self, state: GridState) -> Array:
-        """(4K+2,) float32: object - agent for each object, goal - agent, K flags for delivered objects, K flags for the held one."""
-        index = jnp.arange(self.num_objects)
-        return jnp.concatenate(
-            [
-                (state.objects - state.agent[None]).reshape(-1),
-                state.goal - state.agent,
-                index < state.num_delivered,
-                index == state.held,
-            ],
-            dtype=jnp.float32,
-        )
-
-    def achieved_goal(self, observation: Array) -> Array:
-        """The observation itself (thesis section 3.1.1): (..., 4K+2) -> (..., 4K+2)."""
-        return observation
-
-    def task_goal(self) -> Array:
-        """(4K+2,) the achieved goal of every final state that solves the task in order: zero distances, last object held, all others delivered."""
-        last = np.arange(self.num_objects) == self.num_objects - 1
-        return jnp.asarray(np.concatenate([np.zeros(2 * self.num_objects + 2), ~last, last]), jnp.float32)
-
-    def state_to_vector(self, state: GridState) -> Array:
-        """(state_dim,) float32: agent, objects, goal, num_delivered, held, step; all of the state but its key."""
-        counters = jnp.stack([state.num_delivered, state.held, state.step])
-        return jnp.concatenate([state.agent, state.objects.reshape(-1), state.goal, counters], dtype=jnp.float32)
-
-    def vector_to_state(self, key: Array, vector: Array) -> GridState:
-        """The inverse of `state_to_vector`: (state_dim,) -> the state, with `key` for the teleports that follow."""
-        vector = jnp.asarray(vector).astype(jnp.int32)
-        split = 2 + 2 * self.num_objects
-        return GridState(
-            key=key,
-            agent=vector[:2],
-            objects=vector[2:split].reshape(self.num_objects, 2),
-            goal=vector[split : split + 2],
-            num_delivered=vector[split + 2],
-            held=vector[split + 3],
-            step=vector[split + 4],
-        )
-
-    @abc.abstractmethod
-    def _start_cells(self, bits: Array) -> Array:
-        """Start cells of the agent, the goal and the objects: random bits (K+2,) uint32 -> (K+2, 2) int32."""
-
-    @abc.abstractmethod
-    def _teleport_cell(self, bits: Array, lost: Array, agent: Array, objects: Array, goal: Array) -> Array:
-        """(2,) int32 cell to which object `lost` is teleported, given random bits () uint32 and all cells after the move."""
-
-
-@dataclass(frozen=True)
-class GridPickAndPlace(_PickAndPlace):
+class GridPickAndPlace(GridTask):
     """Everything starts on distinct uniformly random cells, and teleported objects land on a uniformly random free cell (thesis 3.1.1)."""
 
     name: ClassVar[str] = "GridPickAndPlace"
@@ -237,19 +33,19 @@ class GridPickAndPlace(_PickAndPlace):
     def _start_cells(self, bits: Array) -> Array:
         ranks: list[Array] = []
         for i in range(self.num_objects + 2):
-            ranks.append(_free_rank(bits[i], ranks, self.size**2))
-        return jnp.stack([_rank_to_cell(rank, self.size) for rank in ranks])
+            ranks.append(free_rank(bits[i], ranks, self.size**2))
+        return jnp.stack([rank_to_cell(rank, self.size) for rank in ranks])
 
     def _teleport_cell(self, bits: Array, lost: Array, agent: Array, objects: Array, goal: Array) -> Array:
         # A released object is still listed in `objects` at the cell it was released on, so it cannot land there again.
         del lost
         occupied = [agent, goal, *(objects[i] for i in range(self.num_objects))]
         ranks = [cell[1] * self.size + cell[0] for cell in occupied]
-        return _rank_to_cell(_free_rank(bits, ranks, self.size**2), self.size)
+        return rank_to_cell(free_rank(bits, ranks, self.size**2), self.size)
 
 
 @dataclass(frozen=True)
-class FixedGridPickAndPlace(_PickAndPlace):
+class FixedGridPickAndPlace(GridTask):
     """Everything starts in a small box of its own, and teleported objects return to their own start box (thesis 3.1.2).
 
     With d = size and b = random_box_size, the agent starts in the corner box at (0, 0), the goal is in the one at (0, d-1), object 0 starts in the
@@ -268,7 +64,7 @@ class FixedGridPickAndPlace(_PickAndPlace):
             raise ValueError(f"random_box_size must be at least 1, got {self.random_box_size}.")
         if self.num_objects > 7:
             raise ValueError(f"FixedGridPickAndPlace has start boxes for at most 7 objects, got num_objects={self.num_objects}.")
-        if any(_overlap(a, b) for a, b in combinations(self.start_boxes, 2)):
+        if any(overlap(a, b) for a, b in combinations(self.start_boxes, 2)):
             raise ValueError(
                 f"{self.num_objects + 2} start boxes of random_box_size={self.random_box_size} overlap on a grid of size {self.size}; "
                 "raise size, or lower random_box_size or num_objects."
@@ -286,7 +82,7 @@ class FixedGridPickAndPlace(_PickAndPlace):
     def _start_cells(self, bits: Array) -> Array:
         lowest = jnp.array([box[0] for box in self.start_boxes], jnp.int32)
         ranks = (bits % np.uint32(self.random_box_size**2)).astype(jnp.int32)
-        return lowest + jax.vmap(_rank_to_cell, (0, None))(ranks, self.random_box_size)
+        return lowest + jax.vmap(rank_to_cell, (0, None))(ranks, self.random_box_size)
 
     def _teleport_cell(self, bits: Array, lost: Array, agent: Array, objects: Array, goal: Array) -> Array:
         del objects, goal  # they are never in this object's box, other than the teleported object itself
@@ -297,56 +93,4 @@ class FixedGridPickAndPlace(_PickAndPlace):
         offset = agent - lowest
         blocked = jnp.all((offset >= 0) & (offset < width)) & (width > 1)
         agent_rank = jnp.where(blocked, offset[1] * width + offset[0], width**2)
-        return lowest + _rank_to_cell(_free_rank(bits, [agent_rank], width**2), width)
-
-
-def _direction(scores: Array) -> Array:
-    """(2,) int32 unit step for movement scores (4,): 0 is +x, 1 is +y, 2 is -x, 3 is -y; the first of equal scores wins."""
-    move = jnp.argmax(scores)
-    return jnp.stack([move == 0, move == 1]).astype(jnp.int32) - jnp.stack([move == 2, move == 3]).astype(jnp.int32)
-
-
-def _same_cell(a: Array, b: Array) -> Array:
-    """Whether cells (..., 2) are equal -> (...) bool."""
-    return (a[..., 0] == b[..., 0]) & (a[..., 1] == b[..., 1])
-
-
-def _rank_to_cell(rank: Array, width: int) -> Array:
-    """(2,) int32 cell number `rank` of a block `width` cells wide, counted row by row."""
-    return jnp.stack([rank % width, rank // width])
-
-
-def _free_rank(bits: Array, occupied: list[Array], num_ranks: int) -> Array:
-    """Draws uniformly from the ranks 0 .. num_ranks - 1 that are not occupied, without rejection or sorting.
-
-    Draws r0 among the free ranks, counted without the occupied ones, and then shifts it past those: the answer is the least r with
-    r = r0 + (number of distinct occupied ranks <= r). Iterating that equation from r0 climbs to it in at most len(occupied) rounds,
-    because every round but the last passes at least one more occupied rank.
-
-    Args:
-      bits: () uint32 random bits.
-      occupied: () int32 ranks; duplicates count once and entries >= num_ranks are ignored.
-      num_ranks: how many ranks there are; at least one must be free.
-
-    Returns:
-      () int32 rank. Uniform up to the 2**-32 granularity of `bits`.
-    """
-    # A repeated rank is moved out of range, so that it is ignored from here on.
-    distinct: list[Array] = []
-    for rank in occupied:
-        repeated = jnp.zeros((), bool)
-        for earlier in distinct:
-            repeated = repeated | (rank == earlier)
-        distinct.append(jnp.where(repeated, num_ranks, rank))
-    num_free = num_ranks - sum(((rank < num_ranks).astype(jnp.int32) for rank in distinct), jnp.zeros((), jnp.int32))
-    start = (bits % num_free.astype(jnp.uint32)).astype(jnp.int32)
-    rank = start
-    for _ in distinct:
-        rank = start + sum((other <= rank).astype(jnp.int32) for other in distinct)
-    return rank
-
-
-def _overlap(a: Box, b: Box) -> bool:
-    """Whether two boxes share a cell."""
-    (a_low, a_high), (b_low, b_high) = a, b
-    return all(a_low[i] <= b_high[i] and b_low[i] <= a_high[i] for i in range(2))
+        return lowest + rank_to_cell(free_rank(bits, [agent_rank], width**2), width)

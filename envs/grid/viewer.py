@@ -12,7 +12,8 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from hindrl_jax.envs import drawing
-from hindrl_jax.envs.grid.pick_and_place import FixedGridPickAndPlace, GridPickAndPlace, GridState
+from hindrl_jax.envs.grid.rules import GridTask
+from hindrl_jax.envs.grid.types import GridState
 
 _MIN_CELL = 48  # pixels
 _MIN_WIDTH = 360  # pixels, so that the caption fits beside small grids
@@ -30,7 +31,7 @@ _OBJECT = drawing.GREEN
 _DELIVERED = (112, 188, 143)
 
 
-def frame(env: GridPickAndPlace | FixedGridPickAndPlace, state: GridState, *, caption: str = "") -> np.ndarray:
+def frame(env: GridTask, state: GridState, *, caption: str = "") -> np.ndarray:
     """Draws one state.
 
     The agent is a blue disc, the objects are numbered green discs and the goal is the red cell. A held object is drawn inside the agent. An object
@@ -83,33 +84,13 @@ def frame(env: GridPickAndPlace | FixedGridPickAndPlace, state: GridState, *, ca
     return np.concatenate([canvas.pixels(), strip])
 
 
-def save_png(env: GridPickAndPlace | FixedGridPickAndPlace, state: GridState, path: str | PathLike, *, caption: str = "") -> None:
+def save_png(env: GridTask, state: GridState, path: str | PathLike, *, caption: str = "") -> None:
     """Saves the picture that `frame` draws."""
     drawing.save_png(frame(env, state, caption=caption), path)
 
 
-def save_gif(
-    env: GridPickAndPlace | FixedGridPickAndPlace,
-    states: Sequence[GridState] | GridState,
-    path: str | PathLike,
-    *,
-    seconds_per_frame: float = 0.15,
-    captions: Sequence[str] | None = None,
-) -> None:
-    """Saves what `animation` draws as an endlessly repeated one; the last picture stays a second longer.
-
-    Args:
-      path: file to write.
-      env, states, seconds_per_frame, captions: as for `animation`; programs that show GIFs round the seconds to hundredths.
-
-    Raises:
-      ValueError: if there are no states, or not one caption per state.
-    """
-    drawing.save_gif(*animation(env, states, seconds_per_frame=seconds_per_frame, captions=captions), path)
-
-
 def animation(
-    env: GridPickAndPlace | FixedGridPickAndPlace,
+    env: GridTask,
     states: Sequence[GridState] | GridState,
     *,
     seconds_per_frame: float = 0.15,

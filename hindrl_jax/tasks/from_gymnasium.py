@@ -244,7 +244,7 @@ class Simulators:
         self.env, self.num_envs = env, num_envs
         if render_mode is not None and not os.environ.get("MUJOCO_GL"):
             # Else Gymnasium would try one library after the other, and the first failure spoils the next.
-            os.environ["MUJOCO_GL"] = importlib.import_module("hindrl_jax.envs.reach.viewer").opengl_library()
+            os.environ["MUJOCO_GL"] = importlib.import_module("hindrl_jax.envs.panda.opengl").opengl_library()
         make = functools.partial(make_single, env.id, env.arguments, env.horizon, render_mode)
         mode = dict(autoreset_mode=AutoresetMode.DISABLED)  # an episode that has reached its goal is to end, though its environment does not say so
         if env.vectorization == "async":

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from hindrl_jax.base.environments import RestorableEnvironment
-from hindrl_jax.envs.grid import FixedGridPickAndPlace, GridPickAndPlace
-from hindrl_jax.envs.reach import FixedParameterizedReach, ParameterizedReach
+from hindrl_jax.envs import FixedGridPickAndPlace, FixedParameterizedReach, GridPickAndPlace, ParameterizedReach
 
 ENVIRONMENTS = [
     GridPickAndPlace(),

@@ -1,9 +1,5 @@
 """The pictures of the reach tasks: what is drawn where, what is written to disk, and what happens where nothing can be drawn."""
 
-import importlib.util
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import jax
@@ -14,8 +10,9 @@ import pytest
 from PIL import Image
 
 from hindrl_jax.base.errors import UserError
-from hindrl_jax.envs import drawing
-from hindrl_jax.envs.reach import FixedParameterizedReach, ParameterizedReach, ReachState, panda, viewer
+from hindrl_jax.envs import drawing, panda
+from hindrl_jax.envs.panda import meshes, opengl
+from hindrl_jax.envs.reach import FixedParameterizedReach, ParameterizedReach, ReachState, viewer
 
 DOWN = np.diag([1.0, -1.0, -1.0])  # a hand that points straight down
 LEFT, MIDDLE, RIGHT = (0.5, -0.25, 0.25), (0.6, 0.0, 0.35), (0.5, 0.28, 0.15)  # m, as seen from the camera, clear of the arm
@@ -23,15 +20,15 @@ ROOT = Path(__file__).parent.parent.parent
 
 
 @pytest.fixture
-def opengl():
+def opengl_here():
     """The pictures need an OpenGL library on the machine."""
     try:
-        viewer._stage()
+        viewer._renderer()
     except UserError as error:
         pytest.skip(str(error))
 
 
-needs_opengl = pytest.mark.usefixtures("opengl")
+needs_opengl = pytest.mark.usefixtures("opengl_here")
 
 
 def place(positions=(RIGHT, LEFT), *, joints=panda.INITIAL_JOINTS, num_reached=0, step=0):
@@ -56,7 +53,7 @@ def scene_of(picture):
 
 def around(picture, position, radius=30):
     """The pixels (P, 3) around a position in m."""
-    column, row = (round(float(v)) for v in viewer._stage().pixel(np.asarray(position)))
+    column, row = (round(float(v)) for v in viewer._renderer().pixel(np.asarray(position)))
     return scene_of(picture)[row - radius : row + radius, column - radius : column + radius].reshape(-1, 3)
 
 
@@ -91,19 +88,7 @@ def test_the_arm_moves_with_its_joints_and_the_waypoints_stay():
     assert greenish(around(turned, RIGHT)) == greenish(around(before, RIGHT)) > 100
     # The hand is at the same place in the picture as in the dynamics, before and after.
     for joints in (state.joints, state.joints.at[0].add(0.5)):
-        np.testing.assert_allclose(viewer._stage().hand_position(joints), panda.posture(joints).hand_position, atol=1e-5)
-
-
-@needs_opengl
-@pytest.mark.parametrize("position", [LEFT, MIDDLE, RIGHT, (0.1, 0.3, 0.4)])
-def test_positions_are_drawn_where_their_pixel_is_said_to_be(position):
-    stage, position = viewer._stage(), np.asarray(position)
-    stage.pose(panda.INITIAL_JOINTS)
-    without = stage.render().astype(int)
-    up = np.array([0.0, 0.0, 1e-3])
-    stage.rod(position - up, position + up, 0.01, (0.0, 0.0, 1.0, 1.0))
-    rows, columns = np.nonzero((stage.render() != without).any(axis=2))
-    np.testing.assert_allclose([columns.mean() + 0.5, rows.mean() + 0.5], stage.pixel(position), atol=0.7)
+        np.testing.assert_allclose(viewer._renderer().hand_position(joints), panda.posture(joints).hand_position, atol=1e-5)
 
 
 @needs_opengl
@@ -135,13 +120,13 @@ def test_numbers_tell_the_order():
 @needs_opengl
 @pytest.mark.parametrize("rotation", [DOWN, DOWN[:, [1, 0, 2]] * [1, -1, 1], np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])])
 def test_a_marker_lies_as_the_hand_would(rotation):
-    stage, (x, y, z) = viewer._stage(), rotation.T
-    stage.pose(panda.INITIAL_JOINTS)
-    viewer._add_waypoint(stage, np.array(MIDDLE), rotation, 0)
-    picture = stage.render().astype(int)
+    renderer, (x, y, z) = viewer._renderer(), rotation.T
+    renderer.pose(panda.INITIAL_JOINTS)
+    viewer._add_waypoint(renderer, np.array(MIDDLE), rotation, 0)
+    picture = renderer.render().astype(int)
 
     def drawn(offset):
-        column, row = (int(v) for v in stage.pixel(np.add(MIDDLE, offset)))
+        column, row = (int(v) for v in renderer.pixel(np.add(MIDDLE, offset)))
         return greenish(picture[row - 1 : row + 2, column - 1 : column + 2]) > 0
 
     assert drawn(-0.067 * z + 0.05 * y)
@@ -172,7 +157,7 @@ def test_hundreds_of_waypoints_are_no_trouble():
 
 
 @needs_opengl
-def test_the_caption_tells_step_progress_success_and_the_given_text():
+def test_the_caption_shows_step_progress_success_and_the_given_text():
     env, state = FixedParameterizedReach(), place(num_reached=1, step=3)
     caption = viewer.frame(env, state)[-drawing.CAPTION_HEIGHT :]
     for other in (state.replace(step=jnp.int32(4)), state.replace(num_reached=jnp.int32(0))):
@@ -211,12 +196,12 @@ def read_gif(path):
 def test_gif_holds_every_state_in_order_at_its_time(tmp_path, stacked):
     env, states = FixedParameterizedReach(), episode(4)
     path = tmp_path / "episode.gif"
-    viewer.save_gif(env, jax.tree.map(lambda *a: jnp.stack(a), *states) if stacked else states, path)
+    drawing.save_gif(*viewer.animation(env, jax.tree.map(lambda *a: jnp.stack(a), *states) if stacked else states), path)
     pictures, durations = read_gif(path)
     assert durations == [50, 50, 50, 1050]
     frames = [viewer.frame(env, state) for state in states]
     for t, picture in enumerate(pictures):
-        errors = [np.abs(picture - frame).mean() for frame in frames]  # off by a little, because of the palette and the hand's way
+        errors = [np.abs(picture - frame).mean() for frame in frames]  # off by a little, because of the palette and the hand's path
         assert np.argmin(errors) == t
         assert errors[t] < 1.0
 
@@ -241,15 +226,15 @@ def test_long_episodes_are_thinned_out_in_real_time(tmp_path, monkeypatch, lengt
 
     monkeypatch.setattr(viewer, "_draw", draw)
     captions = [f"state {t}" for t in range(length)]
-    viewer.save_gif(FixedParameterizedReach(), episode(length), tmp_path / "episode.gif", captions=captions)
-    assert drawn == [(t, f"state {t}", t + 1) for t in shown]  # the hand's way includes the states that are left out
+    drawing.save_gif(*viewer.animation(FixedParameterizedReach(), episode(length), captions=captions), tmp_path / "episode.gif")
+    assert drawn == [(t, f"state {t}", t + 1) for t in shown]  # the hand's path includes the states that are left out
     assert read_gif(tmp_path / "episode.gif")[1] == durations
 
 
 @needs_opengl
-def test_gif_shows_the_way_of_the_hand(tmp_path):
+def test_gif_shows_the_path_of_the_hand(tmp_path):
     env, states = FixedParameterizedReach(), episode(5)
-    viewer.save_gif(env, states, tmp_path / "episode.gif", seconds_per_frame=0.2)
+    drawing.save_gif(*viewer.animation(env, states, seconds_per_frame=0.2), tmp_path / "episode.gif")
     pictures, durations = read_gif(tmp_path / "episode.gif")
     assert durations == [200] * 4 + [1200]
 
@@ -259,46 +244,23 @@ def test_gif_shows_the_way_of_the_hand(tmp_path):
     assert blue(pictures[-1]).sum() > blue(viewer.frame(env, states[-1])).sum() + 20
 
 
-def test_gif_rejects_what_it_cannot_draw(tmp_path):
+def test_an_animation_rejects_what_it_cannot_draw():
     env = FixedParameterizedReach()
     with pytest.raises(ValueError, match="no states"):
-        viewer.save_gif(env, [], tmp_path / "x.gif")
+        viewer.animation(env, [])
     with pytest.raises(ValueError, match="one caption per state"):
-        viewer.save_gif(env, [place()], tmp_path / "x.gif", captions=["a", "b"])
-
-
-@needs_opengl
-def test_meshes_hang_on_the_same_bodies():
-    model, bare = viewer._model(), panda.model()
-    if importlib.util.find_spec("robosuite") is None:
-        assert model is bare
-        return
-    assert model.nmesh > 0
-    assert not (model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE).any()
-    for attribute in ("nq", "nbody"):
-        assert getattr(model, attribute) == getattr(bare, attribute)
-    for attribute in ("body_pos", "body_quat", "body_mass", "body_inertia", "jnt_range", "site_pos"):
-        np.testing.assert_array_equal(getattr(model, attribute), getattr(bare, attribute))
-
-
-@needs_opengl
-def test_without_robosuite_the_arm_wears_capsules(monkeypatch, tmp_path):
-    monkeypatch.setattr(viewer.importlib.util, "find_spec", lambda name: None)
-    assert viewer._model() is panda.model()
-    # Nor is a robosuite that keeps its files elsewhere any trouble.
-    monkeypatch.setattr(viewer.importlib.util, "find_spec", lambda name: importlib.machinery.ModuleSpec(name, None, origin=str(tmp_path / "x.py")))
-    assert viewer._model() is panda.model()
+        viewer.animation(env, [place()], captions=["a", "b"])
 
 
 def no_opengl(monkeypatch):
-    """Makes every OpenGL library fail, and the viewer set up its stage anew."""
+    """Makes every OpenGL library fail, and the viewer set up a new renderer."""
 
     def fail(name):
         raise ImportError(name)
 
-    monkeypatch.setattr(viewer.importlib, "import_module", fail)
-    monkeypatch.setattr(viewer, "_stage", viewer._Stage)
-    monkeypatch.setattr(viewer, "_model", panda.model)
+    monkeypatch.setattr(opengl.importlib, "import_module", fail)
+    monkeypatch.setattr(viewer, "_renderer", viewer._renderer.__wrapped__)
+    monkeypatch.setattr(meshes, "visible_model", panda.model)
 
 
 def test_without_opengl_one_line_says_what_to_do(monkeypatch, tmp_path):
@@ -307,7 +269,7 @@ def test_without_opengl_one_line_says_what_to_do(monkeypatch, tmp_path):
     for draw in (
         lambda: viewer.frame(FixedParameterizedReach(), place()),
         lambda: viewer.save_png(FixedParameterizedReach(), place(), tmp_path / "x.png"),
-        lambda: viewer.save_gif(FixedParameterizedReach(), [place()], tmp_path / "x.gif"),
+        lambda: drawing.save_gif(*viewer.animation(FixedParameterizedReach(), [place()]), tmp_path / "x.gif"),
     ):
         with pytest.raises(UserError, match="libegl1 or libosmesa6") as caught:
             draw()
@@ -316,43 +278,3 @@ def test_without_opengl_one_line_says_what_to_do(monkeypatch, tmp_path):
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
     with pytest.raises(UserError, match="MUJOCO_GL=osmesa does not work here"):
         viewer.frame(FixedParameterizedReach(), place())
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is no choice")
-@pytest.mark.parametrize(
-    ("egl", "display", "wish", "expected"),
-    [
-        (True, "", "", "egl"),
-        (True, ":0", "", "egl"),
-        (False, "", "", "osmesa"),
-        (False, ":0", "", "glfw"),
-        (True, "", "osmesa", "osmesa"),
-        (False, "", "EGL", "egl"),
-        (True, "", "off", "egl"),
-    ],
-)
-def test_choice_of_the_opengl_library(monkeypatch, egl, display, wish, expected):
-    tried = []
-    no_opengl(monkeypatch)
-    monkeypatch.setattr(viewer.importlib, "import_module", lambda name: tried.append(name))
-    monkeypatch.setattr(viewer, "_egl_has_device", lambda: egl)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    monkeypatch.setenv("DISPLAY", display)
-    monkeypatch.setenv("MUJOCO_GL", wish)
-    with pytest.raises(UserError):
-        viewer._open(panda.model())
-    assert tried == [f"mujoco.{expected}"]
-
-
-@needs_opengl
-def test_a_process_that_has_drawn_ends_quietly():
-    program = """
-import numpy as np
-from hindrl_jax.envs.reach import panda, viewer
-viewer._model = panda.model
-viewer._stage().pose(np.zeros(7))
-viewer._stage().render()
-"""
-    environment = {name: value for name, value in os.environ.items() if name != "PYOPENGL_PLATFORM"} | {"JAX_PLATFORMS": "cpu"}
-    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, env=environment, capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, "")

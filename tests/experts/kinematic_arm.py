@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hindrl_jax.envs.reach import FixedParameterizedReach, panda
+from hindrl_jax.envs import panda
+from hindrl_jax.envs.reach import FixedParameterizedReach
 
 
 def control_step(joints, rest, command):

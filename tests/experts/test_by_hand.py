@@ -12,10 +12,11 @@ from kinematic_arm import KinematicArm
 from hindrl_jax.base.environments import action_to_env
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.envs.reach import FixedParameterizedReach
-from hindrl_jax.experts import by_hand, robosuite_arm
+from hindrl_jax.experts import by_hand
 from hindrl_jax.experts.by_hand import command_of, record_by_hand, record_with
 from hindrl_jax.experts.reach import ReachExpert
-from hindrl_jax.experts.robosuite_arm import play_episode
+from hindrl_jax.experts.robosuite_arm import arm as arms
+from hindrl_jax.experts.robosuite_arm import devices, play_episode
 
 # Every episode of this task is the same: a fixed start, and one fixed waypoint, which is reached within 20 steps or so.
 ENV = FixedParameterizedReach(num_waypoints=1, horizon=40, joint_noise=0.0, position_tolerance=0.1, rotation_tolerance=0.3, backend="robosuite")
@@ -141,10 +142,10 @@ def test_steps_keep_the_time():
     ],
 )
 def test_what_cannot_work_is_refused_at_once(changes, arguments, message, monkeypatch):
-    monkeypatch.setattr(robosuite_arm.sys, "platform", "linux")
+    monkeypatch.setattr(arms.sys, "platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    monkeypatch.setattr(robosuite_arm, "environment_class", lambda: pytest.fail("robosuite was opened"))
+    monkeypatch.setattr(arms, "environment_class", lambda: pytest.fail("robosuite was opened"))
     with pytest.raises(UserError, match=message):
         record_by_hand(jax.random.key(0), dataclasses.replace(ENV, **changes), *arguments)
 
@@ -166,7 +167,7 @@ def test_devices_that_are_not_there_are_refused(missing, error, message, monkeyp
     def not_plugged_in(env):
         raise error
 
-    monkeypatch.setattr(robosuite_arm.importlib, "import_module", import_module)
+    monkeypatch.setattr(devices.importlib, "import_module", import_module)
     with pytest.raises(UserError, match=message) as refusal:
-        robosuite_arm.open_device("spacemouse", SimpleNamespace(environment=None))
+        devices.open_device("spacemouse", SimpleNamespace(environment=None))
     assert "\n" not in str(refusal.value)

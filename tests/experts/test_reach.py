@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from hindrl_jax.base.environments import action_to_env
-from hindrl_jax.envs.reach import FixedParameterizedReach, ParameterizedReach, panda, rotations
+from hindrl_jax.envs import panda, rotations
+from hindrl_jax.envs.reach import FixedParameterizedReach, ParameterizedReach
 from hindrl_jax.experts.reach import ReachExpert
 from hindrl_jax.training.recording import play
 

@@ -26,13 +26,19 @@ FACADE = {"hindrl_jax", "hindrl_jax.__main__"}  # what the package shows, and `p
 # Packages that a room may import, where not every one is allowed.
 STANDARD_LIBRARY = {"__future__", "abc", "collections", "copy", "dataclasses", "enum", "functools", "itertools", "math", "types", "typing"}
 PURE = STANDARD_LIBRARY | {"jax", "flax", "optax", "chex"}
-DRAWING = {"viewer", "drawing"}  # modules of envs that dynamics never import
-SCREEN = {"PIL", "mujoco", "os", "pathlib", "atexit", "ctypes", "importlib", "sys"}  # the last four to open OpenGL
+DRAWING = {"viewer", "drawing", "renderer", "meshes", "opengl"}  # modules of envs that dynamics never import
+SCREEN = {"PIL", "os"}  # what all of them may import
 # What single modules may import beyond the others of their room. robosuite is found and silenced in one module; a person plays in real time.
 BEYOND = {
-    "panda": {"mujoco", "pathlib"},  # to read the model's file
+    "robot": {"mujoco", "pathlib"},  # to read the model's file
     "mjx_dynamics": {"mujoco", "contextlib", "io"},
-    "robosuite_arm": {"robosuite", "mujoco", "contextlib", "importlib", "io", "logging", "os", "sys", "warnings"},
+    "renderer": {"atexit"},
+    "meshes": {"importlib", "pathlib"},
+    "opengl": {"ctypes", "importlib", "sys"},
+    "installation": {"contextlib", "importlib", "io", "logging", "os", "sys", "warnings"},
+    "scene": {"robosuite", "mujoco"},
+    "arm": {"mujoco", "os", "sys"},
+    "devices": {"importlib"},
     "by_hand": {"contextlib", "time"},
 }
 

@@ -16,7 +16,7 @@ import hindrl_jax as hindrl
 from hindrl_jax import cli
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.cli.training import parse_train
-from hindrl_jax.envs.grid import FixedGridPickAndPlace
+from hindrl_jax.envs import FixedGridPickAndPlace
 from hindrl_jax.runs.reader import draw_episodes
 from hindrl_jax.runs.spec import read_spec
 from hindrl_jax.runs.writer import RunWriter

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from hindrl_jax.envs import drawing
 from hindrl_jax.envs.grid import FixedGridPickAndPlace, GridPickAndPlace, GridState, viewer
 
 
@@ -56,7 +57,7 @@ def test_held_shared_and_delivered_objects_look_different():
     assert share(delivered, env, (0, 9), viewer._OBJECT) == 0
 
 
-def test_the_caption_tells_step_deliveries_success_and_the_given_text():
+def test_the_caption_shows_step_deliveries_success_and_the_given_text():
     env = GridPickAndPlace()
     state = place((1, 9), [(0, 9), (9, 9)], (0, 9), num_delivered=1, step=3)
     caption = viewer.frame(env, state)[-viewer._CAPTION_HEIGHT :]
@@ -90,7 +91,8 @@ def test_gif_holds_every_state_in_order(tmp_path, stacked):
     env = GridPickAndPlace(size=5)
     states = [place((x, 0), [(4, 1), (2, 3)], (0, 4), step=x) for x in range(3)]
     path = tmp_path / "episode.gif"
-    viewer.save_gif(env, jax.tree.map(lambda *a: jnp.stack(a), *states) if stacked else states, path, seconds_per_frame=0.2)
+    episode = jax.tree.map(lambda *a: jnp.stack(a), *states) if stacked else states
+    drawing.save_gif(*viewer.animation(env, episode, seconds_per_frame=0.2), path)
     with Image.open(path) as image:
         assert image.n_frames == 3
         for x in range(3):
@@ -102,9 +104,9 @@ def test_gif_holds_every_state_in_order(tmp_path, stacked):
             assert errors[x] < 0.5
 
 
-def test_gif_rejects_what_it_cannot_draw(tmp_path):
+def test_an_animation_rejects_what_it_cannot_draw():
     env = GridPickAndPlace()
     with pytest.raises(ValueError, match="no states"):
-        viewer.save_gif(env, [], tmp_path / "x.gif")
+        viewer.animation(env, [])
     with pytest.raises(ValueError, match="one caption per state"):
-        viewer.save_gif(env, [place((1, 0), [(4, 1), (2, 3)], (0, 4))], tmp_path / "x.gif", captions=["a", "b"])
+        viewer.animation(env, [place((1, 0), [(4, 1), (2, 3)], (0, 4))], captions=["a", "b"])

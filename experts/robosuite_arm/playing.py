@@ -1,0 +1,122 @@
+"""Playing episodes of the reach tasks in robosuite, one after the other, outside JAX.
+
+robosuite only moves the arm. Waypoints and start come from `env.reset`; observation, reward and progress from `env.arrive`, as with the other back
+ends.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hindrl_jax.base.environments import action_from_env
+from hindrl_jax.base.types import Array, Episodes, TimeStep
+from hindrl_jax.envs.reach import ReachState, ReachTask
+from hindrl_jax.experts.robosuite_arm.arm import RobosuiteArm, shared_arm
+
+Act = Callable[[Array, ReachState, Array], Array]
+"""(key, state, observation (D,)) -> action (6,) in the environment's own units."""
+
+
+def play_in_robosuite(key: Array, env: ReachTask, act: Act, num_episodes: int) -> Episodes:
+    """Plays episodes one after the other, with the arm in robosuite.
+
+    Equal keys give the same starts, waypoints and keys for `act` as in `hindrl_jax.training.recording.play`. `act` is compiled once, however often
+    this is called with it.
+
+    Args:
+      key: random key.
+      env: the task, of any back end.
+      act: (key, state, observation (D,)) -> action (6,) in m and rad, which is clipped to the environment's bounds before it goes to robosuite.
+      num_episodes: N.
+
+    Returns:
+      N episodes. Past the end of an episode observations and states are repeated, and actions are 0.
+
+    Raises:
+      UserError: if robosuite is missing or unusable.
+    """
+    arm = shared_arm(env.num_waypoints)
+    episodes = [play_episode(key, env, arm, functools.partial(_act, act)) for key in jax.random.split(key, num_episodes)]
+    return stacked(episodes)
+
+
+def play_episode(key: Array, env: ReachTask, arm: RobosuiteArm, act: Act) -> Episodes:
+    """Plays one episode on the host.
+
+    Args:
+      key: random key.
+      env: the task.
+      arm: anything with the methods `reset` and `step` of `RobosuiteArm`.
+      act: as for `play_in_robosuite`, but any Python function.
+
+    Returns:
+      The episode, NumPy leaves without the episode axis.
+    """
+    key_reset, key = jax.random.split(key)
+    state, observation, vector = _start(env, key_reset)
+    arm.reset(*jax.device_get((state.joints, state.positions, state.rotations)))
+    observations, states, actions, rewards = [observation], [vector], [], []
+    for _ in range(env.horizon):
+        key, key_act = jax.random.split(key)
+        action = act(key_act, state, observation)
+        command, normalised = _command(env, action)
+        joints, velocities = arm.step(np.asarray(command))
+        state, time_step, vector = _arrive(env, state, np.float32(joints), np.float32(velocities))
+        observation = time_step.observation
+        actions.append(normalised)
+        rewards.append(time_step.reward)
+        observations.append(observation)
+        states.append(vector)
+        if time_step.terminated or time_step.truncated:
+            break
+
+    def repeated(rows: list[Array]) -> Any:
+        return np.stack(jax.device_get(rows + rows[-1:] * (env.horizon + 1 - len(rows))))
+
+    def padded(rows: list[Array]) -> Any:
+        array = np.stack(jax.device_get(rows))
+        return np.concatenate([array, np.zeros((env.horizon - len(rows), *array.shape[1:]), array.dtype)])
+
+    ends: dict[str, Any] = dict(lengths=np.int32(len(actions)), terminated=np.bool_(time_step.terminated))
+    return Episodes(
+        observations=repeated(observations),
+        actions=padded(actions),
+        rewards=padded(rewards),
+        desired_goals=jax.device_get(env.achieved_goal(observation)),
+        states=repeated(states),
+        **ends,
+    )
+
+
+def stacked(episodes: list[Episodes]) -> Episodes:
+    """Single episodes, leaves (...), as one table, leaves (N, ...)."""
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *episodes)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _act(act: Act, key: Array, state: ReachState, observation: Array) -> Array:
+    return act(key, state, observation)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _start(env: ReachTask, key: Array) -> tuple[ReachState, Array, Array]:
+    state, observation = env.reset(key)
+    return state, observation, env.state_to_vector(state)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _command(env: ReachTask, action: Array) -> tuple[Array, Array]:
+    """The action as robosuite gets it, and as it is recorded."""
+    return jnp.clip(action, env.action_low, env.action_high), action_from_env(action, env)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _arrive(env: ReachTask, state: ReachState, joints: Array, velocities: Array) -> tuple[ReachState, TimeStep, Array]:
+    state, time_step = env.arrive(state, joints, velocities)
+    return state, time_step, env.state_to_vector(state)
