@@ -19,6 +19,7 @@ from hindrl_jax.base.errors import UserError
 from hindrl_jax.config import AgentConfig, TrainConfig
 from hindrl_jax.core import agent as agents
 from hindrl_jax.core.goals import GoalTable
+from hindrl_jax.core.inputs import InputScale
 from hindrl_jax.core.train import make_policy
 from hindrl_jax.demonstrations.hdf5 import describe_demonstrations, load_demonstrations, save_demonstrations
 from hindrl_jax.envs.reach import FixedParameterizedReach
@@ -139,16 +140,15 @@ def run(arm, tmp_path_factory):
     """A run's directory with two policies that nobody trained."""
     env = dataclasses.replace(COARSE, horizon=4, joint_noise=0.0, backend="closed_form")
     config = TrainConfig(algo="bc", agent=AgentConfig(net_arch=(4,)))
-    dims = dict(observation_dim=env.observation_dim, goal_dim=env.goal_dim, action_dim=env.action_dim)
-    make_agents = jax.jit(jax.vmap(lambda key: agents.init(key, config.agent, **dims)))
+    make_agents = jax.jit(jax.vmap(lambda key, scale: agents.init(key, scale, config, action_dim=env.action_dim)))
     goals = GoalTable(goals=jnp.ones((2, 3, env.goal_dim)), count=jnp.full(2, 3))
     scale = {
         field.name: jnp.ones((2, env.observation_dim if field.name.startswith("observation") else env.goal_dim))
-        for field in dataclasses.fields(agents.InputScale)
+        for field in dataclasses.fields(InputScale)
     }
     result = SimpleNamespace(
-        guidance=SimpleNamespace(behavioural_goals=goals, epsilon=jnp.ones((2, env.goal_dim)), scale=agents.InputScale(**scale)),
-        state=SimpleNamespace(agent=make_agents(jax.random.split(jax.random.key(0), 2))),
+        guidance=SimpleNamespace(behavioural_goals=goals, epsilon=jnp.ones((2, env.goal_dim))),
+        state=SimpleNamespace(agent=make_agents(jax.random.split(jax.random.key(0), 2), InputScale(**scale))),
     )
     path = tmp_path_factory.mktemp("runs") / "untrained"
     runs.RunWriter(path, RunSpec(env=env, config=config, demos="2", seeds=(0, 1)), overwrite=False).start()
@@ -192,8 +192,8 @@ def test_each_seed_plays_its_own_policy_towards_one_of_its_goals_per_episode(run
     assert len(acted) == 8
     observation = env.reset(jax.random.key(0))[1][None]
     for seed in range(2):
-        actor, table, scale = jax.tree.map(lambda leaf, seed=seed: leaf[seed], (loaded.policies, loaded.behavioural_goals, loaded.scale))
-        policy = make_policy(actor, scale, env, config, stochastic=False)
+        policy_of_seed, table = jax.tree.map(lambda leaf, seed=seed: leaf[seed], (loaded.policies, loaded.behavioural_goals))
+        policy = make_policy(policy_of_seed, env, config, stochastic=False)
         possible = [np.asarray(action_to_env(policy(jax.random.key(0), observation, goal[None])[0], env)) for goal in table.goals]
         chosen = set()
         for actions in acted[4 * seed : 4 * seed + 4]:
@@ -214,6 +214,6 @@ def test_evaluation_counts_what_is_solved(run):
 
 def test_evaluation_elsewhere_is_refused(run, tmp_path, capsys):
     assert "backend = 'gazebo' is not usable: it must be one of closed_form, mjx, robosuite" in refusal(capsys, "eval", run, "--backend", "gazebo")
-    grid = Run(tmp_path, RunSpec(make("GridPickAndPlace"), TrainConfig(), "1", (0,)), None, None, None)
+    grid = Run(tmp_path, RunSpec(make("GridPickAndPlace"), TrainConfig(), "1", (0,)), None, None)
     with pytest.raises(UserError, match="GridPickAndPlace has one back end only"):
         grid.in_backend("robosuite")
