@@ -9,12 +9,14 @@ from hypothesis import strategies as st
 
 from hindrl_jax.core.goals import (
     GoalTable,
+    GoalTest,
     constant_goal,
     epsilon_filter,
     epsilon_from_demonstrations,
     final_goals,
     goal_reached,
     goal_table,
+    is_visited,
     nearby_goal,
     sample_goals,
 )
@@ -46,6 +48,15 @@ def test_goal_reached_keeps_leading_axes():
     achieved = jnp.arange(12.0).reshape(2, 3, 2)
     reached = goal_reached(achieved, jnp.broadcast_to(jnp.array([4.0, 5.0]), achieved.shape), jnp.zeros(2))
     np.testing.assert_array_equal(reached, [[False, False, True], [False, False, False]])
+
+
+def test_a_goal_test_projects_observations_and_compares():
+    # Observations (x, y) whose goal is y. From y = 1 and 3 to the goal 2 it is 1 each: inside the box of 1 but not strictly; from 4 it is 2.
+    observations = jnp.array([[9.0, 1.0], [9.0, 3.0], [9.0, 4.0]])
+    for inclusive, expected in ((True, [True, True, False]), (False, [False, False, False])):
+        test = GoalTest(achieved_goal=lambda observation: observation[..., 1:], epsilon=jnp.array([1.0]), inclusive=inclusive)
+        assert test.reached(observations, jnp.full((3, 1), 2.0)).tolist() == expected
+        assert test.reached(observations[None], jnp.full((1, 1, 1), 2.0)).tolist() == [expected]
 
 
 def epsilon_twin(demonstrations, *, m, k):
@@ -121,22 +132,23 @@ GOALS = jnp.array([[[0.0], [1.0], [1.0], [3.0]], [[4.0], [5.0], [99.0], [99.0]]]
 LENGTHS = jnp.array([3, 1])
 
 
+def test_visited_states_are_those_up_to_the_last_one():
+    # An episode of l transitions visits l + 1 states.
+    assert is_visited(LENGTHS, 4).tolist() == [[True, True, True, True], [True, True, False, False]]
+
+
 @pytest.mark.parametrize(
-    ("options", "expected"),
+    ("keep", "expected"),
     [
-        (dict(filtered=False), [0.0, 1.0, 1.0, 3.0, 4.0, 5.0]),
-        (dict(filtered=False, exclude_last=True), [0.0, 1.0, 1.0, 4.0]),
-        (dict(filtered=True, epsilon=0.0), [0.0, 1.0, 3.0, 4.0, 5.0]),
-        (dict(filtered=True, epsilon=0.0, inclusive=False), [0.0, 1.0, 1.0, 3.0, 4.0, 5.0]),
-        (dict(filtered=True, epsilon=1.0), [0.0, 3.0, 4.0]),
-        (dict(filtered=True, epsilon=1.0, inclusive=False), [0.0, 1.0, 3.0, 4.0, 5.0]),
-        (dict(filtered=True, epsilon=1.0, exclude_last=True), [0.0, 4.0]),
-        (dict(filtered=True, epsilon=1.5), [0.0, 3.0, 4.0]),  # the filter starts anew in every demonstration: 4 is near 3 and stays
+        ([[1, 1, 1, 1], [1, 1, 0, 0]], [0.0, 1.0, 1.0, 3.0, 4.0, 5.0]),
+        ([[1, 1, 1, 0], [1, 0, 0, 0]], [0.0, 1.0, 1.0, 4.0]),
+        ([[0, 0, 0, 1], [0, 1, 0, 0]], [3.0, 5.0]),
+        ([[0, 1, 0, 0], [0, 0, 0, 0]], [1.0]),
     ],
 )
-def test_goal_table_by_hand(options, expected):
-    epsilon = jnp.array([options.pop("epsilon", 0.0)])
-    table = goal_table(GOALS, LENGTHS, epsilon, **options)
+def test_goal_table_by_hand(keep, expected):
+    # The kept goals move to the front, in their order; the table keeps its 2 * 4 rows.
+    table = goal_table(jnp.zeros((2, 4, 3)), GOALS, jnp.array(keep, bool))
     assert table.goals.shape == (8, 1)
     assert int(table.count) == len(expected)
     assert table.goals[: len(expected), 0].tolist() == expected
@@ -153,7 +165,7 @@ def test_behavioural_goals():
 
 def test_sampled_goals_are_uniform_over_all_goals_and_never_padding():
     # 6 goals, 3000 draws: each expected 500 times, standard deviation 20; the bounds are five of them away.
-    table = goal_table(GOALS.at[0, 2].set(2.0), LENGTHS, jnp.zeros(1), filtered=False)
+    table = goal_table(GOALS, GOALS.at[0, 2].set(2.0), is_visited(LENGTHS, 4))
     drawn = np.asarray(sample_goals(jax.random.key(0), table, 3000))
     assert drawn.shape == (3000, 1)
     values, counts = np.unique(drawn, return_counts=True)
@@ -179,7 +191,9 @@ def test_nearby_goals_are_those_of_a_plain_loop(epsilon, inclusive):
     goals = np.array([(x, y) for x in range(4) for y in range(4)], np.float32)
     table = GoalTable(goals=jnp.asarray(goals), count=jnp.asarray(13))
     achieved = np.array([(0, 0), (2, 2), (3, 3), (9, 9), (1, 3)], np.float32)
-    pick = jax.jit(lambda key: nearby_goal(key, table, jnp.asarray(achieved), jnp.asarray(epsilon), inclusive=inclusive))
+    test = GoalTest(achieved_goal=lambda observation: observation[..., :2], epsilon=jnp.asarray(epsilon), inclusive=inclusive)
+    observations = jnp.asarray(np.pad(achieved, ((0, 0), (0, 1)), constant_values=7.0))  # the goal is a part of what is observed
+    pick = jax.jit(lambda key: nearby_goal(key, table, observations, test))
     drawn = np.stack([pick(key) for key in jax.random.split(jax.random.key(0), 300)])
     for column, goal in zip(drawn.T, achieved, strict=True):
         assert set(column.tolist()) == set(nearby_twin(goals, 13, goal, epsilon, inclusive=inclusive) or [-1])
@@ -188,7 +202,8 @@ def test_nearby_goals_are_those_of_a_plain_loop(epsilon, inclusive):
 def test_a_nearby_goal_is_any_of_them_with_equal_chances():
     # 3 of 5 goals are near; 1500 draws, 500 each, standard deviation 18.
     table = GoalTable(goals=jnp.array([[0.0], [5.0], [0.5], [6.0], [1.0]]), count=jnp.asarray(5))
-    pick = jax.vmap(lambda key: nearby_goal(key, table, jnp.full((1, 1), 0.5), jnp.array([0.5]))[0])
+    test = GoalTest(achieved_goal=lambda observation: observation, epsilon=jnp.array([0.5]))
+    pick = jax.vmap(lambda key: nearby_goal(key, table, jnp.full((1, 1), 0.5), test)[0])
     counts = np.bincount(np.asarray(pick(jax.random.split(jax.random.key(1), 1500))), minlength=5)
     assert counts[[1, 3]].tolist() == [0, 0]
     assert np.abs(counts[[0, 2, 4]] - 500).max() < 90
@@ -196,6 +211,6 @@ def test_a_nearby_goal_is_any_of_them_with_equal_chances():
 
 def test_observations_stay_beside_the_goals_that_were_reached_there():
     observations = jnp.concatenate([GOALS * 10.0, -GOALS], axis=-1)
-    table = goal_table(GOALS, LENGTHS, jnp.full(GOALS.shape[-1], 0.5), filtered=True, exclude_last=True, observations=observations)
-    count = int(table.count)
-    np.testing.assert_array_equal(table.observations[:count], np.concatenate([table.goals * 10.0, -table.goals], axis=-1)[:count])
+    table = goal_table(observations, GOALS, jnp.array([[1, 0, 1, 0], [0, 1, 0, 0]], bool))
+    assert table.observations[:3].tolist() == [[0.0, -0.0], [10.0, -1.0], [50.0, -5.0]]
+    np.testing.assert_array_equal(table.observations, np.concatenate([table.goals * 10.0, -table.goals], axis=-1))
