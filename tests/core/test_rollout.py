@@ -46,7 +46,7 @@ def test_episodes_end_where_they_should(played):
         assert np.asarray(time_steps.reward[:, env]).tolist() == (ends & solves).tolist()
 
 
-def test_episodes_are_cut_where_they_are_told_to_be_unless_the_step_solves_them():
+def test_episodes_are_cut_where_they_should_be_unless_the_step_solves_them():
     key, key_anew = jax.random.split(jax.random.key(1))
     state, anew = (rollout.reset(k, ENV, GOALS, 3) for k in (key, key_anew))
     state, _ = rollout.step(state, anew, ACTIONS, ENV, cut=jnp.zeros(3, bool))
@@ -112,7 +112,7 @@ DEMONSTRATIONS = corridor_demonstrations((1.0, 0.7), env=ENV)  # 4 and 5 steps, 
 @functools.partial(jax.jit, static_argnames="ratio")
 def starts(key, ratio):
     table = rollout.StartTable(states=DEMONSTRATIONS.states, lengths=DEMONSTRATIONS.lengths)
-    return rollout.reset(key, ENV, GOALS, 3000, starts=table, demo_reset_ratio=ratio)
+    return rollout.reset(key, ENV, GOALS, 3000, rollout.DemoResets(starts=table, ratio=ratio, share=1.0))
 
 
 @pytest.mark.parametrize("ratio", [0.0, 0.3, 1.0])
