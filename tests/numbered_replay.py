@@ -57,6 +57,18 @@ class Numbered(Corridor):
         return observation
 
 
+@dataclasses.dataclass(frozen=True)
+class NumberedTask(Numbered):
+    """The task is about two states, which are observed: hindsight writes them, as decimal digits, into the first two numbers of an observation. It is
+    solved at the step of the second."""
+
+    num_subgoals: int = 2
+
+    def retell(self, key, observations, subgoals):
+        codes = 1000.0 + subgoals @ jnp.array([100.0, 10.0, 1.0])
+        return observations.at[:, :2].add(10.0 * codes[None]), observations[1:, 2] >= subgoals[1, 2]
+
+
 def batch_of(strategy, **changes):
     """BATCH with one of STRATEGIES."""
     return dataclasses.replace(BATCH, hindrl_sampling_strategy=strategy.split()[-1], **STRATEGIES[strategy], **changes)

@@ -49,7 +49,10 @@ def replay_of_both():
     return empty.replace(episodes=episodes, slot=jnp.array([2]), num_complete=jnp.array([2]))
 
 
-def goal_test(quirks=QuirksConfig(), epsilon=1.0):
+NO_QUIRKS = QuirksConfig()
+
+
+def goal_test(quirks=NO_QUIRKS, epsilon=1.0):
     return GoalTest(
         achieved_goal=Line().achieved_goal,
         epsilon=jnp.array([epsilon]),

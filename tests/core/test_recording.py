@@ -1,0 +1,238 @@
+"""What training records: every stored episode is one that was played, from the start, with the goal and the notes that it should have."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from corridor_training import (
+    COLLECT_STEPS,
+    HORIZON,
+    LEARN_STEPS,
+    NUM_ENVS,
+    SPEEDS,
+    make_config,
+    make_data,
+    make_env,
+    recorded_episodes,
+    with_output_bias,
+)
+from toy_env import corridor_demonstrations
+
+from hindrl_jax.config import BatchConfig, GoalConfig
+from hindrl_jax.core import agent as agents
+from hindrl_jax.core import train
+from hindrl_jax.core.batch import JUDGED_BY_GOAL, sample_batch
+from hindrl_jax.core.hindsight import NEARBY_GOAL
+
+
+@pytest.fixture(scope="module")
+def data():
+    return make_data(make_config())
+
+
+@pytest.fixture(scope="module")
+def recorded(data):
+    """The replay after `collect` and `learn`, and after `learn` again; the first policy plays (0.5, -0.5) and a little noise."""
+    env, config = make_env(), make_config()
+
+    @jax.jit
+    def start(key):
+        state = train.collect(train.init(key, data, env, config), data, env=env, config=config, num_iterations=COLLECT_STEPS)
+        return with_output_bias(state, [np.arctanh(0.5), np.arctanh(-0.5), -5.0, -5.0])
+
+    learn = jax.jit(functools.partial(train.learn, env=env, config=config, num_iterations=LEARN_STEPS))
+    first, _ = learn(start(jax.random.key(0)), data)
+    second, _ = learn(first, data)
+    return jax.device_get((first.replay, second.replay))
+
+
+def test_replay_holds_what_was_played(recorded, data):
+    goals = np.asarray(data.behavioural_goals.goals)
+    starts = []
+    for _, length, episode in recorded_episodes(recorded[1]):
+        observations, actions, rewards = episode.observations[: length + 1], episode.actions[:length], episode.rewards[:length]
+        starts.append(observations[0, 0])
+        assert np.all(observations[:, 0] == observations[0, 0])  # one episode, not two
+        assert observations[:, 1].tolist() == list(range(length + 1))
+        np.testing.assert_allclose(np.diff(observations[:, 2]), actions[:, 0] + 1.0, atol=1e-5)  # policy units to velocities
+        assert rewards.tolist() == (observations[1:, 2] > 4.0).tolist()
+        assert bool(episode.terminated) == bool(rewards[-1])
+        assert rewards[:-1].sum() == 0.0
+        assert episode.terminated or length == HORIZON
+        assert np.any(episode.desired_goals == goals)
+        assert np.abs(actions).max() <= 1.0
+    assert len(starts) >= NUM_ENVS * 2
+    assert len(set(starts)) == len(starts)
+    assert recorded[1].notes == {}
+
+
+def test_actions_are_uniform_at_first_and_the_policys_when_learning(recorded):
+    replay = recorded[0]
+    slots, first_of_policy = len(replay.episodes.lengths) // NUM_ENVS, set()
+    for env in range(NUM_ENVS):
+        rows = [(env * slots + slot, length) for slot, length in enumerate(replay.episodes.lengths[env * slots : (env + 1) * slots]) if length]
+        rows.append((env * slots + replay.slot[env], replay.step[env]))  # the episode under way
+        actions = np.concatenate([replay.episodes.actions[row, :length] for row, length in rows])
+        assert len(actions) == COLLECT_STEPS + LEARN_STEPS
+        # The policy has moved by a few Adam steps of 1e-3; a uniform action is as near as that to it with probability 1e-3 at most.
+        from_policy = np.all(np.abs(actions - np.array([0.5, -0.5])) < 0.05, axis=1)
+        assert from_policy.tolist() == [False] * COLLECT_STEPS + [True] * LEARN_STEPS
+        assert actions[:COLLECT_STEPS].std() > 0.4  # U(-1, 1) has 0.58
+        first_of_policy.add(float(actions[COLLECT_STEPS, 0]))
+    assert len(first_of_policy) == NUM_ENVS  # sampled: the mean action is the same in all environments
+
+
+def collected_and_evaluated(config, data):
+    """The replay after 60 steps of random actions, and 20 evaluated episodes of a policy that walks with velocity 1, whatever it sees."""
+    env = make_env()
+
+    @jax.jit
+    def run(key):
+        key_init, key_evaluate = jax.random.split(key)
+        state = train.init(key_init, data, env, config)
+        state = with_output_bias(train.collect(state, data, env=env, config=config, num_iterations=60), [0.0, 0.0, 0.0, 0.0])
+        policy = agents.policy(state.agent, average=False)
+        return state.replay, train.evaluate(key_evaluate, policy, data, env=env, config=config, num_episodes=20)
+
+    return jax.device_get(run(jax.random.key(0)))
+
+
+def test_training_episodes_may_begin_in_demonstrated_states_and_evaluations_never_do():
+    config = make_config(demo_reset_ratio=1.0, batch=BatchConfig(n_step=1))
+    demonstrations, data = corridor_demonstrations(SPEEDS, env=make_env()), make_data(config)
+    assert data.starts.lengths.sum() == 14
+    assert data.demonstrations.states is None
+
+    replay, evaluation = collected_and_evaluated(config, data)
+    begun = set()
+    for _, length, episode in recorded_episodes(replay):
+        observations = episode.observations
+        demo, start = int(observations[0, 0]) - 10, int(observations[0, 1])
+        np.testing.assert_array_equal(observations[0], demonstrations.observations[demo, start])
+        assert start < demonstrations.lengths[demo]
+        assert observations[: length + 1, 1].tolist() == list(range(start, start + length + 1))  # the steps are counted on
+        assert start + length == HORIZON or episode.terminated
+        begun.add((demo, start))
+    assert len(begun) > 7  # of 14
+    assert evaluation.length.tolist() == [5] * 20  # from 0, velocity 1 passes 4 in the fifth step
+
+
+def test_training_episodes_are_cut_at_random_and_evaluations_never_are(data):
+    replay, evaluation = collected_and_evaluated(make_config(random_truncation=0.5), data)
+    complete = replay.episodes.lengths > 0
+    lengths = replay.episodes.lengths[complete & ~replay.episodes.terminated]
+    assert lengths.size > 20
+    assert 1.0 < lengths.mean() < 3.0  # 2 steps, if none were cut by the horizon
+    assert evaluation.length.tolist() == [5] * 20
+
+
+def test_a_reverse_curriculum_widens_from_the_end_of_the_demonstrations():
+    # Demonstrations of 5, 4 and 5 steps. The curriculum lasts for half of the 1,200 steps; each of the 3 environments takes 400 of them.
+    env = make_env()
+    config = make_config(demo_reset_ratio=1.0, demo_reset_curriculum=0.5, steps=1200, batch=BatchConfig(n_step=1))
+    demonstrations, data = corridor_demonstrations(SPEEDS, env=env), make_data(config)
+
+    @jax.jit
+    def begin(key, progress):
+        return jax.vmap(lambda key: train._new_episodes(key, data, env, config, progress).observation)(jax.random.split(key, 300))
+
+    for progress, share in ((0.0, 0.0), (0.25, 0.5), (0.5, 1.0), (1.0, 1.0)):
+        observations = np.asarray(begin(jax.random.key(1), progress)).reshape(-1, 3)
+        for demo, length in enumerate(demonstrations.lengths.tolist()):
+            eligible = min(max(int(np.ceil(share * length)), 1), length)
+            begun = observations[observations[:, 0] == 10 + demo, 1]
+            assert sorted(set(begun.tolist())) == list(range(length - eligible, length)), (progress, demo)
+
+    # It follows how far the run is: no episode of the first 30 steps of all begins before the last state but one.
+    state = jax.jit(lambda key: train.collect(train.init(key, data, env, config), data, env=env, config=config, num_iterations=10))(jax.random.key(0))
+    starts = [episode.observations[0] for _, _, episode in recorded_episodes(state.replay)]
+    assert len(starts) >= 3
+    assert all(start[1] >= demonstrations.lengths[int(start[0]) - 10] - 1 for start in starts)
+
+
+def test_achieved_goals_are_given_to_new_episodes_and_judge_them():
+    env = make_env()
+    batch = BatchConfig(batch_size=64, relabelled_per_original=0, n_step=1, max_demo_ratio=0.0)
+    config = make_config(goal=GoalConfig(achieved_goal_ratio=1.0), batch=batch)
+    data = make_data(config, (1.0,))
+
+    @jax.jit
+    def run(key):
+        key_init, key_batch = jax.random.split(key)
+        state = train.collect(train.init(key_init, data, env, config), data, env=env, config=config, num_iterations=60)
+        return state, sample_batch(key_batch, state.replay, data, state.env_steps, env, config)
+
+    state, batch = run(jax.random.key(0))
+    batch = jax.device_get(batch)
+    replay, task_goal = jax.device_get(state.replay), float(data.behavioural_goals.goals[0, 0])
+    goals, seen, num_episodes = [], set(), 0
+    for row, length, episode in recorded_episodes(replay):
+        (judged,) = set(replay.notes[JUDGED_BY_GOAL][row, :length].tolist())  # the same in all of an episode
+        if judged:
+            goals.append(float(episode.desired_goals[0]))
+        else:
+            assert float(episode.desired_goals[0]) == task_goal
+        seen |= set(episode.observations[: length + 1, 2].tolist())
+        num_episodes += 1
+    assert set(goals) <= seen  # each was reached in some episode
+    assert len(set(goals)) > 10
+    assert len(goals) >= num_episodes - 2 * NUM_ENVS  # all but the first episodes, when there was no past
+    # Rows of those episodes are rewarded for their goal alone, and only where it is reached exactly; the others by the environment.
+    judged = batch.desired_goal[:, 0] != task_goal
+    assert judged.sum() > 0
+    assert not batch.is_relabelled.any()
+    reached = batch.next_observation[:, 2] == batch.desired_goal[:, 0]
+    np.testing.assert_array_equal(batch.reward[judged], reached[judged])
+    solved = batch.next_observation[:, 2] > env.width
+    np.testing.assert_array_equal(batch.discount == 0.0, (judged & reached) | solved)
+
+
+def test_achieved_goals_cost_no_copy_of_the_replay(data):
+    config = make_config(goal=GoalConfig(achieved_goal_ratio=0.5))
+    state = jax.eval_shape(lambda key: train.init(key, data, make_env(), config), jax.random.key(0))
+    run = functools.partial(train.learn, env=make_env(), config=config, num_iterations=LEARN_STEPS)
+    memory = jax.jit(run, donate_argnums=0).lower(state, data).compile().memory_analysis()
+    assert memory.temp_size_in_bytes < state.replay.episodes.actions.size * 4
+
+
+def test_the_share_of_achieved_goals_moves_linearly():
+    env, goal = make_env(), GoalConfig(achieved_goal_ratio=0.8, final_achieved_goal_ratio=0.0)
+    config = make_config(goal=goal, num_envs=500, buffer_size=500 * 2 * HORIZON, steps=10**6)
+    data = make_data(config, (1.0,))
+
+    @jax.jit
+    def judged(key):
+        key_init, key_new, key_goals = jax.random.split(key, 3)
+        state = train.collect(train.init(key_init, data, env, config), data, env=env, config=config, num_iterations=HORIZON)
+        episodes = train._new_episodes(key_new, data, env, config, 0.0)
+
+        def at(env_steps):
+            begun = train._with_achieved_goals(key_goals, episodes, state.replace(env_steps=env_steps), env, config)
+            return jnp.sum(begun.notes[JUDGED_BY_GOAL])
+
+        return jax.vmap(at)(jnp.array([0, 500_000, 1_000_000]))
+
+    # Of 500: 400, 200 and none; standard deviations up to 11.
+    np.testing.assert_allclose(judged(jax.random.key(0)), [400, 200, 0], atol=55)
+
+
+def test_a_demonstrated_goal_near_the_end_of_each_transition_is_noted_where_intersections_need_it():
+    # Goals are 0, 1, ..., 5 and epsilon is 0.2, so that about 4 of 10 positions are near one, and only one.
+    env = make_env()
+    config = make_config(batch=BatchConfig(hindrl_sampling_strategy="joint_intersection"), goal=GoalConfig(epsilon=0.2))
+    data = make_data(config, (1.0,))
+    replay = jax.jit(lambda key: train.collect(train.init(key, data, env, config), data, env=env, config=config, num_iterations=40))(
+        jax.random.key(0)
+    ).replay
+    notes, goals, near = np.asarray(replay.notes[NEARBY_GOAL]), np.arange(6.0), []
+    for row, length, episode in recorded_episodes(replay):
+        for t in range(length):
+            distances = np.abs(goals - episode.observations[t + 1, 2])
+            expected = int(distances.argmin()) if distances.min() <= 0.2 else -1
+            assert notes[row, t] == expected
+            near.append(expected >= 0)
+    assert len(near) > 60
+    assert 0.2 < np.mean(near) < 0.6
+    assert (notes[np.asarray(replay.episodes.lengths) == 0, -1] == -1).all()  # not written yet
