@@ -110,6 +110,21 @@ def test_relabelled_observations_are_about_states_of_their_source_in_their_order
     assert {"task_conditioned": foreign == 1.0, "joint_union": 0.0 < foreign < 1.0}.get(strategy, foreign == 0.0)
 
 
+def test_episodes_judged_by_their_goal_do_not_change_what_relabelled_observations_are_worth():
+    # No state equals a behavioural goal, so that original rows of such episodes get no reward.
+    history, _ = replay_history([[3, 2], [1, 3]])
+    replay, config = at(history, 17), TrainConfig(batch=batch_of("future"))
+    judged = replay.replace(notes={JUDGED_BY_GOAL: np.ones_like(replay.episodes.rewards, bool)})
+    expected, batch = (jax.device_get(draw_batch(jax.random.key(0), given, config, env=NumberedTask())) for given in (replay, judged))
+    np.testing.assert_array_equal(batch.observation, expected.observation)
+    relabelled, original = batch.is_relabelled, ~batch.is_relabelled & ~batch.is_demonstration
+    assert relabelled.sum() == NUM_RELABELLED
+    for name in ("reward", "discount", "next_observation"):
+        np.testing.assert_array_equal(getattr(batch, name)[relabelled], getattr(expected, name)[relabelled])
+    assert expected.reward[relabelled].any()
+    assert (expected.reward[original].any(), batch.reward[original].any()) == (True, False)
+
+
 def test_union_draws_from_both_sources_and_relabelling_can_be_off():
     history, _ = replay_history([[3], [3]])
     batch = draw_batch(jax.random.key(0), at(history, 20), TrainConfig(batch=batch_of("joint_union")))

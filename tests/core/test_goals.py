@@ -122,7 +122,15 @@ def test_filter_is_that_of_a_plain_loop(goals, epsilon, inclusive):
     np.testing.assert_array_equal(mask, filter_twin(goals, epsilon, inclusive=inclusive))
 
 
-def test_filter_measures_from_the_last_kept_goal_not_from_the_one_before():
+@pytest.mark.parametrize(("inclusive", "kept"), [(True, [True, False, True, False, True]), (False, [True, True, True, True, True])])
+def test_filter_by_hand(inclusive, kept):
+    # Epsilon is 1 in x and 1 in y. The first goal is kept; (1, 0) is 1 away from it in x, on the edge of its box, which belongs to it unless the test
+    # is strict. (1, 2) is 2 away in y from (0, 0), and from (1, 0). (2, 2) is 1 away in x from (1, 2), on the edge again. (5, 2) is outside.
+    goals = jnp.array([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0], [2.0, 2.0], [5.0, 2.0]])
+    assert epsilon_filter(goals, jnp.array([1.0, 1.0]), inclusive=inclusive).tolist() == kept
+
+
+def test_filter_by_hand_measures_from_the_last_kept_goal_not_from_the_one_before():
     # Steps of 0.4 with epsilon 0.5 creep out of the box: 0 -> 0.8 (0.4 is near 0) -> 1.6 (1.2 is near 0.8).
     goals = jnp.array([[0.0], [0.4], [0.8], [1.2], [1.6]])
     assert epsilon_filter(goals, jnp.array([0.5])).tolist() == [True, False, True, False, True]

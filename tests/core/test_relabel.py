@@ -69,6 +69,7 @@ def goal_test(quirks=NO_QUIRKS, epsilon=1.0):
         (3687, 4.0, 2949),  # 3687 * 4/5 = 2949.6, rounded down; the thesis's batch of 4096 has 3687 replay rows, and n = 4
         (10_800, 4.0, 8640),  # its batch of 12,000
         (3687, 0.5, 1229),  # one relabelled row for two others: 3687 / 3 exactly
+        (108, 1.4, 63),  # 108 * 7/12 = 63 exactly, which float32 takes for a little less
         (5, 1.0, 2),  # 2.5
         (7, 0.0, 0),
         (0, 4.0, 0),
