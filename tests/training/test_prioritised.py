@@ -289,7 +289,7 @@ def test_prioritised_training_over_two_seeds():
 
     before = start(jnp.arange(2))
     former = jax.device_get(before.sampler)
-    learn = jax.vmap(functools.partial(train.learn, data=data, env=env, config=config, num_iterations=LEARN_STEPS, sampler=sampler))
+    learn = jax.vmap(functools.partial(train.learn, guidance=data, env=env, config=config, num_iterations=LEARN_STEPS, sampler=sampler))
     learn = jax.jit(learn, donate_argnums=0).lower(before).compile()
     state, metrics = learn(before)
     chex.assert_tree_all_finite((state.agent, metrics, state.sampler))
