@@ -64,7 +64,7 @@ class NumberedTask(Numbered):
 
     num_subgoals: int = 2
 
-    def retell(self, key, observations, subgoals):
+    def relabel_observations(self, key, observations, subgoals):
         codes = 1000.0 + subgoals @ jnp.array([100.0, 10.0, 1.0])
         return observations.at[:, :2].add(10.0 * codes[None]), observations[1:, 2] >= subgoals[1, 2]
 

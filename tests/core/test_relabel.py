@@ -191,7 +191,7 @@ class LineWithTarget(Line):
     def achieved_goal(self, observation):
         return observation[..., :1]
 
-    def retell(self, key, observations, subgoals):
+    def relabel_observations(self, key, observations, subgoals):
         target = subgoals[0, 0]
         return observations.at[:, 1].set(target), observations[1:, 0] >= target
 
