@@ -11,7 +11,6 @@ import jax.numpy as jnp
 from flax import struct
 
 import hindrl_jax as hindrl
-from hindrl_jax.base.types import TimeStep
 
 
 @struct.dataclass(kw_only=True)
@@ -54,7 +53,7 @@ class TwoRooms:
         solved = jnp.linalg.norm(state.position - self.task_goal()) < 0.05
         truncated = (state.step >= self.horizon) & ~solved
         reward = solved.astype(jnp.float32)
-        return state, TimeStep(observation=self.observe(state), reward=reward, terminated=solved, truncated=truncated)
+        return state, hindrl.TimeStep(observation=self.observe(state), reward=reward, terminated=solved, truncated=truncated)
 
     def observe(self, state):
         return jnp.append(state.position, state.gate)

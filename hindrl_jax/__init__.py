@@ -7,24 +7,25 @@
     result = hindrl.fit(env, demonstrations, hindrl.preset("hindrl"), seeds=[0])
     print(result.final_success)
 
-The algorithm is in `goals`, `relabel`, `replay`, `networks`, `losses`, `agent`, `rollout` and `train`: pure functions that know no task by name.
+The algorithm is in `hindrl_jax.core`: pure functions that know no task by name. Everything in `__all__` is public.
 """
 
 from __future__ import annotations
 
 import importlib
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 STARTED = time.perf_counter()  # this package loads before the large ones it uses: `hindrl train` says how long its start took
 
-# Loaded on first use: `envs` and `experts` import the core below this package, and the names here import `envs` and `experts`.
+# Loaded on first use, since most of them load JAX. A test holds this table and the imports below it together.
 _EXPORTS = {
     "Checkpoints": "hindrl_jax.runs.checkpoints",
     "ProgressBar": "hindrl_jax.reporting.progress",
     "Result": "hindrl_jax.training.experiment",
     "TensorBoardReporter": "hindrl_jax.reporting.reporters",
+    "TimeStep": "hindrl_jax.base.types",
     "UserError": "hindrl_jax.base.errors",
     "WandbReporter": "hindrl_jax.reporting.reporters",
     "fit": "hindrl_jax.training.experiment",
@@ -42,14 +43,34 @@ _EXPORTS = {
 __all__ = ["__version__", *_EXPORTS]
 
 
-importlib.import_module("hindrl_jax.tasks.ids").register()  # so that `gymnasium.make("hindrl/...")` finds our environments
+if TYPE_CHECKING:
+    from hindrl_jax.base.errors import UserError as UserError
+    from hindrl_jax.base.types import TimeStep as TimeStep
+    from hindrl_jax.demonstrations.hdf5 import load_demonstrations as load_demonstrations
+    from hindrl_jax.demonstrations.hdf5 import save_demonstrations as save_demonstrations
+    from hindrl_jax.reporting.progress import ProgressBar as ProgressBar
+    from hindrl_jax.reporting.reporters import TensorBoardReporter as TensorBoardReporter
+    from hindrl_jax.reporting.reporters import WandbReporter as WandbReporter
+    from hindrl_jax.runs.checkpoints import Checkpoints as Checkpoints
+    from hindrl_jax.runs.reader import load_run as load_run
+    from hindrl_jax.runs.writer import save_run as save_run
+    from hindrl_jax.tasks.presets import preset as preset
+    from hindrl_jax.tasks.registry import make as make
+    from hindrl_jax.tasks.registry import register as register
+    from hindrl_jax.training.experiment import Result as Result
+    from hindrl_jax.training.experiment import fit as fit
+    from hindrl_jax.training.experiment import record_demonstrations as record_demonstrations
+    from hindrl_jax.training.host import record_gymnasium as record_gymnasium
+else:  # a type checker that saw this would believe in every name
 
-
-def __getattr__(name: str) -> Any:
-    if name in _EXPORTS:
-        return getattr(importlib.import_module(_EXPORTS[name]), name)
-    raise AttributeError(f"module 'hindrl_jax' has no attribute {name!r}")
+    def __getattr__(name: str) -> Any:
+        if name in _EXPORTS:
+            return getattr(importlib.import_module(_EXPORTS[name]), name)
+        raise AttributeError(f"module 'hindrl_jax' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
     return sorted(set(globals()) | set(__all__))
+
+
+importlib.import_module("hindrl_jax.tasks.ids").register()  # so that `gymnasium.make("hindrl/...")` finds our environments

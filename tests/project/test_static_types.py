@@ -1,10 +1,63 @@
-"""The type checker has nothing to say, as in `make lint`."""
+"""The type checker has nothing to say, as in `make lint`, and knows what the package shows."""
 
+import ast
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+import hindrl_jax as hindrl
+
+ROOT = Path(__file__).parent.parent.parent
+FACADE = ROOT / "hindrl_jax" / "__init__.py"
+
+
+def mypy(*arguments):
+    command = [sys.executable, "-m", "mypy", *arguments]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+
 
 def test_mypy_passes():
-    outcome = subprocess.run([sys.executable, "-m", "mypy"], cwd=Path(__file__).parent.parent.parent, capture_output=True, text=True, timeout=300)
+    outcome = mypy()
     assert outcome.returncode == 0, outcome.stdout + outcome.stderr
+
+
+def test_mypy_knows_what_the_package_shows(tmp_path):
+    """The functions with their parameters; and a name that does not exist."""
+    lines = [f"reveal_type(hindrl.{name})" for name in hindrl.__all__]
+    code = tmp_path / "own_project.py"
+    code.write_text("\n".join(["import hindrl_jax as hindrl", *lines, 'hindrl.fit("FixedGridPickAndPlace", [])', "hindrl.fitt"]))
+    said = mypy(str(code)).stdout
+    revealed = dict(zip(hindrl.__all__, [line for line in said.splitlines() if "Revealed type is" in line], strict=True))
+    assert [name for name, line in revealed.items() if 'is "Any"' in line] == []
+    assert "def (env: " in revealed["fit"]
+    assert "seeds: typing.Sequence[int]" in revealed["fit"].replace("collections.abc.", "typing.")
+    assert "-> hindrl_jax.training.experiment.Result" in revealed["fit"]
+    assert 'Missing positional argument "config" in call to "fit"' in said
+    assert 'Module has no attribute "fitt"' in said
+
+
+def test_names_are_loaded_from_where_type_checkers_see_them():
+    """Every name of the table is imported for type checkers from the same module, as itself: without "as", it would be private to them."""
+    imports = [node for node in ast.walk(ast.parse(FACADE.read_text())) if isinstance(node, ast.ImportFrom) and node.module.startswith("hindrl_jax.")]
+    aliases = [(alias.name, alias.asname, node.module) for node in imports for alias in node.names]
+    assert [name for name, as_name, _ in aliases if as_name != name] == []
+    assert {name: module for name, _, module in aliases} == hindrl._EXPORTS
+
+
+@pytest.mark.parametrize("name", hindrl.__all__)
+def test_names_are_there_and_documented(name):
+    assert getattr(hindrl, name) is not None
+    assert name in dir(hindrl)
+    assert name == "__version__" or f"[`{name}`]" in (ROOT / "docs" / "api" / "outside.md").read_text()
+
+
+def test_importing_the_package_loads_nothing_large():
+    """Gymnasium, whose registry learns our ids, is the largest."""
+    code = "import sys; before = set(sys.modules); import hindrl_jax; print(*sorted(set(sys.modules) - before))"
+    loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
+    large = {"jax", "jaxlib", "flax", "optax", "chex", "h5py", "matplotlib", "mujoco", "orbax", "PIL"}
+    assert {name.partition(".")[0] for name in loaded} & large == set()
+    own = [name for name in loaded if name.startswith("hindrl_jax.")]
+    assert own == ["hindrl_jax.base", "hindrl_jax.base.errors", "hindrl_jax.tasks", "hindrl_jax.tasks.ids"]
