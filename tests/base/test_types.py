@@ -52,7 +52,10 @@ def test_protocols(env):
 def test_only_mjx_on_a_cpu_needs_options_of_the_compiler(monkeypatch):
     plain = [Corridor(), GridPickAndPlace(), FixedParameterizedReach(), FixedParameterizedReach(backend="robosuite")]
     assert [compiler_options(env) for env in plain] == [{}] * 4
-    options = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_enable_concurrency_optimized_scheduler": False}
+    options = {"xla_cpu_enable_concurrency_optimized_scheduler": False}
+    monkeypatch.setattr(jax, "__version_info__", (0, 11, 1))
     assert compiler_options(ParameterizedReach(backend="mjx")) == options
+    monkeypatch.setattr(jax, "__version_info__", (0, 11, 0))
+    assert compiler_options(ParameterizedReach(backend="mjx")) == options | {"xla_cpu_use_fusion_emitters": False}
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert compiler_options(ParameterizedReach(backend="mjx")) == {}

@@ -19,9 +19,10 @@ def mujoco_at(joints, velocities=0.0, model=None):
 
 
 def mass_matrix(model, data):
-    matrix = np.zeros((7, 7))
-    mujoco.mj_fullM(model, matrix, data.qM)
-    return matrix
+    columns = np.zeros((7, 7))
+    for column, unit in zip(columns, np.eye(7), strict=True):  # rather than mj_fullM, whose arguments differ between versions
+        mujoco.mj_mulM(model, data, column, unit)
+    return columns.T
 
 
 def jacobian(model, data):
