@@ -6,13 +6,28 @@ PEERS_PIP = benchmarks/$(PIP) -r benchmarks/requirements-peers.txt
 INTEROP_PIP = tests/interop/$(PIP)
 TORCH = torch torchvision
 
-.PHONY: train test test-slow test-interop coverage lint docs package bench clean
+# The newest JAX wants a newer Python than the oldest does: the newest one that starts, of PATH's and of pyenv's.
+PYTHONS = $(foreach minor,14 13 12,python3.$(minor) $(wildcard $(HOME)/.pyenv/versions/3.$(minor).*/bin/python)) $(PYTHON)
+NEWEST_PYTHON ?= $(shell for python in $(PYTHONS); do if $$python -c "" 2>/dev/null; then echo $$python; break; fi; done)
+NEWEST_PIP = $(subst .venv,.venv-newest,$(PIP)) --upgrade --upgrade-strategy eager
+# The extra `test` without what pins MuJoCo, and without what looks at text only.
+NEWEST_EXTRAS = .[gymnasium-robotics,minari,tensorboard,video]
+NEWEST_TOOLS = pytest pytest-xdist hypothesis
+
+.PHONY: train test test-newest test-versions test-slow test-interop coverage lint docs package bench clean
 
 train: .venv/.installed  ## one demonstration, one seed, about a minute and a half
 	.venv/bin/hindrl train --env FixedGridPickAndPlace --algo hindrl --demos 1 --seed 2 --out runs/quickstart --overwrite
 
 test: .venv/.installed-test  ## two files at a time; more would need 5 GiB of memory each
 	.venv/bin/python -m pytest --numprocesses auto --maxprocesses 2 --dist loadfile
+
+test-newest: .venv-newest/bin/python  ## the fast tests with the newest JAX, Flax, Optax, Chex and MuJoCo, in an environment of its own
+	@$(NEWEST_PIP) -e '$(NEWEST_EXTRAS)' $(NEWEST_TOOLS)
+	@.venv-newest/bin/python -m pip list --disable-pip-version-check | grep -E '^(jax|jaxlib|flax|optax|chex|mujoco|mujoco-mjx|orbax-checkpoint|numpy) '
+	.venv-newest/bin/python -m pytest --numprocesses auto --maxprocesses 2 --dist loadfile --ignore tests/project
+
+test-versions: test test-newest  ## both ends of what is supported: the locked versions, and the newest
 
 test-slow: .venv/.installed-test  ## the learning tests, which take minutes each
 	.venv/bin/python -m pytest -m slow
@@ -42,7 +57,7 @@ bench: .venv/.installed benchmarks/.venv/.installed  ## writes benchmarks/RESULT
 	.venv/bin/python -m benchmarks.run $(BENCH)
 
 clean:  ## everything that can be made again; results in runs/ stay
-	rm -rf .venv benchmarks/.venv tests/interop/.venv build dist site docs/generated .coverage .mypy_cache .pytest_cache .hypothesis .ruff_cache *.egg-info
+	rm -rf .venv benchmarks/.venv tests/interop/.venv .venv-newest build dist site docs/generated .coverage .mypy_cache .pytest_cache .hypothesis .ruff_cache *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The stamp files say which lock was installed last, so that a second call installs nothing.
@@ -59,6 +74,12 @@ clean:  ## everything that can be made again; results in runs/ stay
 	@echo "installing the tests' packages into .venv ..."
 	@$(PIP) -r requirements-test.lock
 	@touch $@
+
+.venv-newest/bin/python:
+	@$(NEWEST_PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 12))' || \
+	  { echo "the newest JAX needs Python >= 3.12; name one: make test-newest NEWEST_PYTHON=python3.13" >&2; exit 1; }
+	@echo "installing the newest versions into .venv-newest ..."
+	@$(NEWEST_PYTHON) -m venv .venv-newest
 
 # robomimic is installed without what it asks for: of that, its datasets and scripts need only these, and egl_probe has to be compiled.
 tests/interop/.venv/.installed: requirements-test.lock requirements.lock
