@@ -27,6 +27,6 @@ tiny="--steps 260 --num-envs 2 --learning-starts 200 --eval-every 40 --eval-epis
 venv/bin/hindrl train --env FixedGridPickAndPlace --demos 1 $tiny --out run
 # The arm's model is a data file of the package: MJX and the pictures read it.
 venv/bin/hindrl demos record --env FixedParameterizedReach --demos 1 --out arm.hdf5
-venv/bin/python -c 'import hindrl_jax; from hindrl_jax.envs.reach import panda; hindrl_jax.make("FixedParameterizedReach", backend="mjx"); print(panda.model().nq, "joints")'
+venv/bin/python -c 'import hindrl_jax; from hindrl_jax.envs import panda; hindrl_jax.make("FixedParameterizedReach", backend="mjx"); print(panda.model().nq, "joints")'
 test -s run/episode.gif
 echo "$(basename "$package") works with $("$python" --version)"

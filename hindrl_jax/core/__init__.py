@@ -1,5 +1,5 @@
 """The algorithm, as pure functions over documented pytrees: no disk, no printing, no environment by name.
 
-Public are, from the ground up, `goals`, `hindsight`, `priorities`, `replay`, `networks`, `losses`, `agent`, `rollout` and `train`; the last one's
-`guidance`, `init`, `collect`, `learn` and `evaluate` are what the room `training` compiles.
+All modules are public. Data: `goals`, `hindsight` (sources of goals), `replay`, `steps`, `relabel`, `batch`. Learning: `networks`, `inputs`, `losses`
+over `kernels`, `agent`. Both together: `rollout`, `guidance` (what demonstrations give), and `train`, whose functions the room `training` compiles.
 """

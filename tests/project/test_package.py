@@ -56,7 +56,7 @@ def test_one_name_is_installed(wheel):
 
 def test_wheel_and_sdist_hold_every_file_once(built, wheel):
     expected = set.union(*(files(top, package) for top, package in {"hindrl_jax": "hindrl_jax", **FOLDERS}.items()))
-    assert "hindrl_jax/envs/reach/panda.xml" in expected
+    assert "hindrl_jax/envs/panda/panda.xml" in expected
     names = [name for name in wheel.namelist() if ".dist-info/" not in name]
     assert sorted(names) == sorted(expected)
     with tarfile.open(next(built.glob("*.tar.gz"))) as sdist:
@@ -76,7 +76,7 @@ def test_it_works_where_envs_and_experts_are_somebody_elses(wheel, tmp_path):
 import envs, experts, hindrl_jax
 assert envs.MINE and experts.MINE
 hindrl_jax.make("FixedGridPickAndPlace")
-from hindrl_jax.envs.reach import panda
+from hindrl_jax.envs import panda
 assert panda.model().nq == 7
 print(hindrl_jax.envs.__file__)
 """
