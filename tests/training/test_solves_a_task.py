@@ -1,7 +1,7 @@
 """Learning works: the command solves a task, by its own recipe, with a hundred demonstrations and a shorter training.
 
-With them all of eight seeds that were tried reached 100% within 26,000 environment steps and stayed there. The compiler does its full work here, unlike
-in the other fast tests: a minute on two cores, half of it compilation.
+With them all of eight seeds that were tried reached 100% within 26,000 environment steps and stayed there. The compiler does its full work here,
+unlike in the other fast tests: half a minute on two idle cores, two thirds of it compilation.
 """
 
 import json
