@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from hindrl_jax.core.priorities import Priorities
 from jax.sharding import Mesh
 
 import hindrl_jax
@@ -17,7 +18,6 @@ from hindrl_jax.base.types import Array, Transition
 from hindrl_jax.config import BatchConfig, TrainConfig
 from hindrl_jax.core import priorities, replay
 from hindrl_jax.core import train as training
-from hindrl_jax.core.priorities import Priorities
 from hindrl_jax.core.train import Guidance, TrainState
 from hindrl_jax.training.devices import over_seeds, spread
 

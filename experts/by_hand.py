@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hindrl_jax.base.environments import on_host
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Array, Episodes
 from hindrl_jax.envs import panda
@@ -55,7 +54,7 @@ def record_by_hand(key: Array, env: ReachTask, device: DeviceName, num_demos: in
         raise UserError(f"num_demos = {num_demos} is too few: record at least 1 demonstration")
     if device not in get_args(DeviceName):
         raise UserError(f"there is no device {device!r}: choose one of {', '.join(get_args(DeviceName))}")
-    if not on_host(env):
+    if env.steps_in_jax:
         raise UserError(f"a person steers the arm of robosuite, not that of backend = {env.backend}: use backend = robosuite")
     arm = RobosuiteArm(env.num_waypoints, on_screen=True)
     with contextlib.closing(arm):

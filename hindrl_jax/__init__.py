@@ -23,7 +23,7 @@ STARTED = time.perf_counter()  # this package loads before the large ones it use
 _EXPORTS = {
     "Checkpoints": "hindrl_jax.runs.checkpoints",
     "ProgressBar": "hindrl_jax.reporting.progress",
-    "Result": "hindrl_jax.training.experiment",
+    "Result": "hindrl_jax.training.result",
     "TensorBoardReporter": "hindrl_jax.reporting.reporters",
     "TimeStep": "hindrl_jax.base.types",
     "UserError": "hindrl_jax.base.errors",
@@ -33,8 +33,8 @@ _EXPORTS = {
     "load_run": "hindrl_jax.runs.reader",
     "make": "hindrl_jax.tasks.registry",
     "preset": "hindrl_jax.tasks.presets",
-    "record_demonstrations": "hindrl_jax.training.experiment",
-    "record_gymnasium": "hindrl_jax.training.host",
+    "record_demonstrations": "hindrl_jax.training.recording",
+    "record_gymnasium": "hindrl_jax.training.recording",
     "register": "hindrl_jax.tasks.registry",
     "save_demonstrations": "hindrl_jax.demonstrations.hdf5",
     "save_run": "hindrl_jax.runs.writer",
@@ -57,10 +57,10 @@ if TYPE_CHECKING:
     from hindrl_jax.tasks.presets import preset as preset
     from hindrl_jax.tasks.registry import make as make
     from hindrl_jax.tasks.registry import register as register
-    from hindrl_jax.training.experiment import Result as Result
+    from hindrl_jax.training.result import Result as Result
     from hindrl_jax.training.experiment import fit as fit
-    from hindrl_jax.training.experiment import record_demonstrations as record_demonstrations
-    from hindrl_jax.training.host import record_gymnasium as record_gymnasium
+    from hindrl_jax.training.recording import record_demonstrations as record_demonstrations
+    from hindrl_jax.training.recording import record_gymnasium as record_gymnasium
 else:  # a type checker that saw this would believe in every name
 
     def __getattr__(name: str) -> Any:

@@ -92,6 +92,11 @@ class ReachTask(abc.ABC):
         return _ACTION_BOUND
 
     @property
+    def steps_in_jax(self) -> bool:
+        """False with robosuite, which simulates one arm outside JAX; see `hindrl_jax.base.environments.can_step`."""
+        return self.backend != "robosuite"
+
+    @property
     def compiler_options(self) -> dict[str, Any]:
         """Options for XLA programs that step this environment. On CPUs, XLA's concurrent scheduler can leave large batches of MJX waiting for ever,
         and its newer fusion code made MJX several hundred times slower (both seen with jaxlib 0.10.2); from 0.11.1 on, MJX is fast with that code,
@@ -168,7 +173,7 @@ class ReachTask(abc.ABC):
         Raises:
           ValueError: with the robosuite back end, which is not a JAX program.
         """
-        if self.backend == "robosuite":
+        if not self.steps_in_jax:
             raise ValueError("robosuite simulates one arm outside JAX: record or evaluate with it, and train with closed_form or mjx")
         control_step = mjx_dynamics.control_step if self.backend == "mjx" else closed_form.control_step
         joints, velocities = control_step(state.joints, state.velocities, state.rest, jnp.clip(action, self.action_low, self.action_high))

@@ -1,8 +1,14 @@
-"""What an environment is, and what it may be able to do beyond that."""
+"""What an environment is, and what it may be able to do beyond that.
+
+`Environment` describes a task. What can be done with it are abilities: `Steppable` in JAX, `hindrl_jax.base.steppers.HostStepped` outside it,
+`Restorable` states, and observations that hindsight can change (`RelabelsObservations`). Whoever needs an ability asks for it, never for a kind.
+"""
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Protocol, runtime_checkable
+import dataclasses
+from collections.abc import Callable
+from typing import Any, ClassVar, Protocol, TypeGuard, get_args, get_type_hints, runtime_checkable
 
 import jax.numpy as jnp
 
@@ -11,10 +17,7 @@ from hindrl_jax.base.types import Array, TimeStep
 
 @runtime_checkable
 class Environment(Protocol):
-    """A goal-conditioned task as pure functions. Implementations are frozen dataclasses: hashable, and static under `jax.jit`.
-
-    `reset` and `step` are unbatched; the caller applies `jax.vmap`. The state is any pytree and carries its own random key.
-    """
+    """A goal-conditioned task, whoever steps it. Implementations are frozen dataclasses: hashable, and static under `jax.jit`."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
@@ -44,12 +47,6 @@ class Environment(Protocol):
     def action_high(self) -> Any:
         """Upper bound, likewise."""
 
-    def reset(self, key: Array) -> tuple[Any, Array]:
-        """Starts an episode: key -> (state, observation (D,))."""
-
-    def step(self, state: Any, action: Array) -> tuple[Any, TimeStep]:
-        """Takes one step: action (A,) in the environment's own units, clipped to its bounds."""
-
     def achieved_goal(self, observation: Array) -> Array:
         """The projection Phi of thesis section 2.2: observations (..., D) -> achieved goals (..., G)."""
 
@@ -57,18 +54,39 @@ class Environment(Protocol):
         """(G,) one fixed goal that stands for "the task is solved"."""
 
 
+@runtime_checkable
+class Steppable(Environment, Protocol):
+    """An environment that is stepped by pure functions in JAX. They are unbatched; the caller applies `jax.vmap`.
+
+    The state is any pytree and carries its own random key. Where the choice of a back end decides whether the functions work, a property
+    `steps_in_jax` says so; ask with `can_step`.
+    """
+
+    def reset(self, key: Array) -> tuple[Any, Array]:
+        """Starts an episode: key -> (state, observation (D,))."""
+
+    def step(self, state: Any, action: Array) -> tuple[Any, TimeStep]:
+        """Takes one step: action (A,) in the environment's own units, clipped to its bounds."""
+
+
+def can_step(env: Any) -> TypeGuard[Steppable]:
+    """Whether the environment can be stepped inside a compiled program, with the back end that it has now."""
+    return isinstance(env, Steppable) and getattr(env, "steps_in_jax", True)
+
+
+def backends_with(env: Any, ability: Callable[[Any], bool]) -> list[str]:
+    """The back ends of an environment, choices of its field `backend`, with which it has an ability, for example `can_step`."""
+    choices = get_args(get_type_hints(type(env))["backend"]) if hasattr(env, "backend") else ()
+    return [choice for choice in choices if ability(dataclasses.replace(env, backend=choice))]
+
+
 def compiler_options(env: Environment) -> dict[str, Any]:
     """Options that XLA needs for programs that step this environment, for `jax.jit` or `compile`; most environments need none."""
     return getattr(env, "compiler_options", {})
 
 
-def on_host(env: Any) -> bool:
-    """Whether the environment is simulated outside JAX, by robosuite: one episode after the other, and never inside a compiled program."""
-    return getattr(env, "backend", None) == "robosuite"
-
-
 @runtime_checkable
-class RestorableEnvironment(Environment, Protocol):
+class Restorable(Environment, Protocol):
     """An environment whose state can be written down as a vector and read back: to be drawn, or to begin an episode there."""
 
     @property
@@ -83,6 +101,16 @@ class RestorableEnvironment(Environment, Protocol):
 
     def vector_to_state(self, key: Array, vector: Array) -> Any:
         """The state of a vector (S,), with this key."""
+
+
+def state_dim(env: Environment) -> int:
+    """Length of the vectors of a `Restorable` environment's states; 0 for another, which has none."""
+    return env.state_dim if isinstance(env, Restorable) else 0
+
+
+@runtime_checkable
+class RestorableEnvironment(Steppable, Restorable, Protocol):
+    """What a task of one's own is: stepped in JAX, its states restorable."""
 
 
 @runtime_checkable

@@ -15,7 +15,7 @@ import tyro
 from rich import box
 from rich.table import Table
 
-from hindrl_jax.base.environments import RestorableEnvironment, on_host
+from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.files import check_can_write, disk_trouble
 from hindrl_jax.base.types import Episodes
@@ -31,7 +31,8 @@ from hindrl_jax.experts.robosuite_arm import DeviceName
 from hindrl_jax.plotting.curves import save_filter
 from hindrl_jax.runs.reader import draw_episodes
 from hindrl_jax.tasks.registry import TASKS, make, task
-from hindrl_jax.training.experiment import record_demonstrations
+from hindrl_jax.training.playing import plays_one_by_one
+from hindrl_jax.training.recording import record_demonstrations
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +73,7 @@ def record(arguments: list[str]) -> None:
     check_can_write(options.out, overwrite=options.overwrite)
     if options.device is None:
         expert = dataclasses.asdict(parsed.expert)
-        with console.status("recording") if on_host(env) else contextlib.nullcontext():  # it takes seconds for each episode
+        with console.status("recording") if plays_one_by_one(env) else contextlib.nullcontext():  # it takes seconds for each episode
             demonstrations = record_demonstrations(env, options.demos, seed=options.seed, expert=parsed.expert)
     else:
         if parsed.expert != entry.expert():
@@ -91,7 +92,7 @@ def record(arguments: list[str]) -> None:
     console.print(f"wrote {options.out}: {counted(len(lengths), 'demonstration')} of {env.name}, mean length {lengths.mean():.1f} steps")
 
 
-def _record_by_hand(env: Any, options: Record) -> tuple[RestorableEnvironment, Episodes]:
+def _record_by_hand(env: Any, options: Record) -> tuple[Environment, Episodes]:
     """The environment in robosuite, and what a person did there."""
     if not hasattr(env, "backend"):
         raise UserError(f"--device {options.device} steers a robot's arm, and {env.name} has none: choose a reach environment, or drop --device")
@@ -261,7 +262,7 @@ def _how(options: Info | PlotDemo) -> str:
 
 def _parse_with_meaning(
     options_class: type[Any], arguments: list[str], program: str, description: str | None
-) -> tuple[Any, Interpretation, RestorableEnvironment | None]:
+) -> tuple[Any, Interpretation, Environment | None]:
     """The options of a command that reads files of any tool: its own, what the modalities mean, and the environment, if one is named."""
     name = peek(arguments, "env")
     fields: list[tuple[str, Any, Any]] = [

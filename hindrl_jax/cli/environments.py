@@ -7,7 +7,7 @@ import dataclasses
 from rich import box
 from rich.table import Table
 
-from hindrl_jax.base.environments import RestorableEnvironment
+from hindrl_jax.base.environments import Environment
 from hindrl_jax.cli.common import console, parse
 from hindrl_jax.tasks.from_gymnasium import GymnasiumEnv
 from hindrl_jax.tasks.registry import TASKS
@@ -18,7 +18,7 @@ def show(arguments: list[str]) -> None:
     parse(dataclasses.make_dataclass("Envs", []), arguments, "hindrl envs", "List the environments with their dimensions.")
     table = Table("environment", "observation", "goal", "action", "horizon", box=box.SIMPLE_HEAD)
     for entry in TASKS.values():
-        env: RestorableEnvironment = entry.environment()
+        env: Environment = entry.environment()
         table.add_row(env.name, *map(str, (env.observation_dim, env.goal_dim, env.action_dim, env.horizon)))
     console.print(table)
     for entry in TASKS.values():

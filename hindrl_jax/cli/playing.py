@@ -14,7 +14,7 @@ from rich.table import Table
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.cli.common import console, counted, episode_key, parse
 from hindrl_jax.runs.reader import load_run
-from hindrl_jax.training.recording import on_host
+from hindrl_jax.training.playing import plays_one_by_one
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +42,7 @@ def evaluate(arguments: list[str]) -> None:
     if options.backend is not None:
         run = run.in_backend(options.backend)
     columns = (TextColumn("{task.completed}/{task.total} episodes"), BarColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not on_host(run.spec.env)) as progress:
+    with Progress(*columns, console=console, transient=True, disable=not plays_one_by_one(run.spec.env)) as progress:
         bar = progress.add_task("", total=options.episodes * len(run.spec.seeds))
         outcomes = run.evaluate(
             episodes=options.episodes,

@@ -17,7 +17,8 @@ from hindrl_jax.base.errors import UserError
 from hindrl_jax.cli.common import console, counted, parse, seeds_from
 from hindrl_jax.reproduction import ablation
 from hindrl_jax.tasks.registry import did_you_mean
-from hindrl_jax.training.experiment import Result, steps_to_learn
+from hindrl_jax.training.checks import steps_to_learn
+from hindrl_jax.training.result import Result
 
 
 @dataclasses.dataclass(frozen=True)

@@ -35,7 +35,10 @@ from hindrl_jax.runs.sweep import SweepWriter, read_sweep
 from hindrl_jax.runs.writer import RunWriter, summarise
 from hindrl_jax.tasks.presets import ORIGINAL_RULES, Preset, preset
 from hindrl_jax.tasks.registry import checked, did_you_mean, make, task
-from hindrl_jax.training.experiment import Diverged, Result, check_config, check_trainable, fit, record_demonstrations
+from hindrl_jax.training.checks import check_config, check_trainable
+from hindrl_jax.training.experiment import Diverged, fit
+from hindrl_jax.training.recording import record_demonstrations
+from hindrl_jax.training.result import Result
 
 
 @dataclasses.dataclass(frozen=True)

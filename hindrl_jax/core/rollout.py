@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from hindrl_jax.base.environments import Environment, RestorableEnvironment, action_to_env
+from hindrl_jax.base.environments import Restorable, Steppable, action_to_env
 from hindrl_jax.base.types import Array, TimeStep, tree_where
 from hindrl_jax.core.goals import GoalTable, sample_goals
 from hindrl_jax.core.randomness import uniform_in_groups
@@ -30,7 +30,7 @@ class RolloutState(struct.PyTreeNode, kw_only=True):
 class StartTable(struct.PyTreeNode, kw_only=True):
     """Demonstrated states in which an episode may begin: all but the last of each demonstration, where nothing is left to do."""
 
-    states: Array  # (N, T + 1, S) as vectors, see `RestorableEnvironment`; padded
+    states: Array  # (N, T + 1, S) as vectors, see `Restorable`; padded
     lengths: Array  # (N,) int32, number of transitions
 
 
@@ -61,12 +61,12 @@ class DemoResets(NamedTuple):
     """The share of each demonstration, up to its end, that its states are drawn from."""
 
 
-def reset(key: Array, env: Environment, behavioural_goals: GoalTable, num_envs: int, demo_resets: DemoResets | None = None) -> RolloutState:
+def reset(key: Array, env: Steppable, behavioural_goals: GoalTable, num_envs: int, demo_resets: DemoResets | None = None) -> RolloutState:
     """Starts `num_envs` episodes, each with a goal drawn from the table (thesis algorithm 5).
 
     Args:
       key: random key.
-      env: static; a `RestorableEnvironment` if there are `demo_resets`.
+      env: static; `Restorable`, too, if there are `demo_resets`.
       behavioural_goals: the table.
       num_envs: E.
       demo_resets: whether and where some episodes begin in demonstrated states.
@@ -74,7 +74,7 @@ def reset(key: Array, env: Environment, behavioural_goals: GoalTable, num_envs: 
     key_env, key_goal = jax.random.split(key)
     env_state, observation = jax.vmap(env.reset)(jax.random.split(key_env, num_envs))
     if demo_resets is not None:
-        restorable = cast(RestorableEnvironment, env)
+        restorable = cast(Restorable, env)
         key_choice, key_start, key_states = jax.random.split(jax.random.fold_in(key, 2), 3)  # 2: split has used what 0 and 1 give
         vectors = sample_starts(key_start, demo_resets.starts, num_envs, share=demo_resets.share)
         demonstrated = jax.vmap(restorable.vector_to_state)(jax.random.split(key_states, num_envs), vectors)
@@ -89,9 +89,7 @@ def reset(key: Array, env: Environment, behavioural_goals: GoalTable, num_envs: 
     )
 
 
-def step(
-    rollout: RolloutState, restarted: RolloutState, action: Array, env: Environment, *, cut: Array | None = None
-) -> tuple[RolloutState, TimeStep]:
+def step(rollout: RolloutState, restarted: RolloutState, action: Array, env: Steppable, *, cut: Array | None = None) -> tuple[RolloutState, TimeStep]:
     """Steps every environment, and goes on from a new episode where one has ended.
 
     Args:
@@ -118,7 +116,7 @@ class Evaluation(struct.PyTreeNode, kw_only=True):
     length: Array  # (episodes,) int32, steps taken
 
 
-def evaluate(key: Array, env: Environment, behavioural_goals: GoalTable, act: Act, num_episodes: int) -> Evaluation:
+def evaluate(key: Array, env: Steppable, behavioural_goals: GoalTable, act: Act, num_episodes: int) -> Evaluation:
     """Plays fresh episodes to their end; an episode is a success if any of its rewards is positive.
 
     Args:

@@ -7,13 +7,13 @@ over its gradient steps. How they are drawn is a `Sampler`, uniform by default.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from hindrl_jax.base.environments import Environment
+from hindrl_jax.base.environments import Environment, Steppable
 from hindrl_jax.base.types import Array, TimeStep, Transition, tree_where
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.core import agent as agents
@@ -83,21 +83,23 @@ def init(
     capacity = config.buffer_size if config.learns_from_rollouts else 2 * config.num_envs * env.horizon  # the smallest one
     notes: dict[str, int] = {NEARBY_GOAL: -1} if config.batch.uses_intersections else {}
     notes |= {JUDGED_BY_GOAL: False} if config.goal.has_achieved_goals else {}
+    if begun is None:
+        begun = _new_episodes(key_rollout, guidance, cast(Steppable, env), config, 0.0)
     empty = replay.init(env, num_envs=config.num_envs, capacity=capacity, notes=notes)
     return TrainState(
         agent=agents.init(key_agent, guidance.scale, config, action_dim=env.action_dim),
         replay=empty,
-        rollout=_with_notes(_new_episodes(key_rollout, guidance, env, config, 0.0) if begun is None else begun, config),
+        rollout=_with_notes(begun, config),
         sampler=() if sampler is None else sampler.init(guidance, empty),
         key=key_train,
-        env_steps=jnp.asarray(0),
-        updates=jnp.asarray(0),
-        resets=jnp.asarray(0),
-        updates_at_reset=jnp.asarray(0),
+        env_steps=jnp.zeros((), jnp.int32),
+        updates=jnp.zeros((), jnp.int32),
+        resets=jnp.zeros((), jnp.int32),
+        updates_at_reset=jnp.zeros((), jnp.int32),
     )
 
 
-def _new_episodes(key: Array, guidance: Guidance, env: Environment, config: TrainConfig, progress: Array | float) -> RolloutState:
+def _new_episodes(key: Array, guidance: Guidance, env: Steppable, config: TrainConfig, progress: Array | float) -> RolloutState:
     demo_resets = None
     if guidance.starts is not None:
         share = jnp.minimum(progress / config.demo_reset_curriculum, 1.0) if config.demo_reset_curriculum > 0.0 else 1.0
@@ -175,7 +177,7 @@ def act_at_random(env: Environment) -> Act:
     return act
 
 
-def _interact(key: Array, state: TrainState, guidance: Guidance, env: Environment, config: TrainConfig, act: Act) -> TrainState:
+def _interact(key: Array, state: TrainState, guidance: Guidance, env: Steppable, config: TrainConfig, act: Act) -> TrainState:
     """One step of every environment, stored in the replay."""
     key_act, key_reset, key_goals, key_nearby, key_cut = jax.random.split(key, 5)
     before = state.rollout
@@ -227,7 +229,7 @@ def continue_from(key: Array, state: TrainState, after: RolloutState, time_step:
 
 
 def collect(
-    state: TrainState, guidance: Guidance, *, env: Environment, config: TrainConfig, num_iterations: int, sampler: Sampler | None = None
+    state: TrainState, guidance: Guidance, *, env: Steppable, config: TrainConfig, num_iterations: int, sampler: Sampler | None = None
 ) -> TrainState:
     """Fills the replay by uniformly random actions: `num_iterations` steps of every environment."""
     sampler = sampler or uniform_sampler(env, config)
@@ -241,7 +243,7 @@ def collect(
 
 
 def learn(
-    state: TrainState, guidance: Guidance, *, env: Environment, config: TrainConfig, num_iterations: int, sampler: Sampler | None = None
+    state: TrainState, guidance: Guidance, *, env: Steppable, config: TrainConfig, num_iterations: int, sampler: Sampler | None = None
 ) -> tuple[TrainState, Metrics]:
     """`num_iterations` times: one step of every environment, then `updates_per_iteration` gradient steps.
 
@@ -293,6 +295,6 @@ def clone(state: TrainState, guidance: Guidance, *, env: Environment, config: Tr
     return state, jax.tree.map(jnp.mean, metrics)
 
 
-def evaluate(key: Array, policy: Policy, guidance: Guidance, *, env: Environment, config: TrainConfig, num_episodes: int) -> Evaluation:
+def evaluate(key: Array, policy: Policy, guidance: Guidance, *, env: Steppable, config: TrainConfig, num_episodes: int) -> Evaluation:
     """Plays fresh episodes with the policy's mean actions, see `rollout.evaluate`."""
     return rollout.evaluate(key, env, guidance.behavioural_goals, make_policy(policy, env, config, stochastic=False), num_episodes)

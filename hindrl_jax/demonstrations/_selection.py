@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hindrl_jax.base.environments import RestorableEnvironment
+from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.demonstrations.foreign import ForeignDemonstration, ForeignRecording, Interpretation
 
@@ -30,7 +30,7 @@ class Selection:
         return sorted({key for columns in (self.observation, self.achieved_goal, self.desired_goal) for key, _ in columns})
 
 
-def select(foreign: ForeignRecording, meaning: Interpretation, env: RestorableEnvironment | None) -> Selection:
+def select(foreign: ForeignRecording, meaning: Interpretation, env: Environment | None) -> Selection:
     """What a user has named, else the usual names.
 
     Args:

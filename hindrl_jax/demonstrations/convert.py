@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from hindrl_jax.base.environments import RestorableEnvironment
+from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.files import check_can_write, write_atomically
 from hindrl_jax.base.types import Episodes
@@ -44,7 +44,7 @@ def open_source(source: str) -> ForeignRecording | Recording:
     return read_recording(path) if robomimic.is_ours(path) else robomimic.read(path)
 
 
-def read(source: str, meaning: Interpretation | None = None, env: RestorableEnvironment | None = None) -> Recording:
+def read(source: str, meaning: Interpretation | None = None, env: Environment | None = None) -> Recording:
     """Reads demonstrations of any format.
 
     Args:
@@ -59,7 +59,7 @@ def read(source: str, meaning: Interpretation | None = None, env: RestorableEnvi
 
 
 def understand(
-    found: ForeignRecording | Recording, source: str, meaning: Interpretation | None = None, env: RestorableEnvironment | None = None
+    found: ForeignRecording | Recording, source: str, meaning: Interpretation | None = None, env: Environment | None = None
 ) -> Recording:
     """The second half of `read`, for what `open_source` has found."""
     if isinstance(found, Recording):
@@ -79,7 +79,7 @@ def understand(
     return recording
 
 
-def load(source: str, env: RestorableEnvironment, *, num_demos: int | None = None) -> Episodes:
+def load(source: str, env: Environment, *, num_demos: int | None = None) -> Episodes:
     """Demonstrations of any format to learn from in `env`, as `load_demonstrations` gives them.
 
     A file of another tool must have the usual names (observation, and perhaps desired_goal); else convert it first.

@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from hindrl_jax.base.environments import RestorableEnvironment
+from hindrl_jax.base.environments import Environment, state_dim
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Episodes
 from hindrl_jax.demonstrations.recording import RECORD_AGAIN, Demonstration, Recording, plain
@@ -20,7 +20,7 @@ from hindrl_jax.tasks.registry import full_name
 _GOAL_TOLERANCE = 1e-4
 
 
-def as_episodes(recording: Recording, env: RestorableEnvironment, *, where: str | os.PathLike[str], num_demos: int | None = None) -> Episodes:
+def as_episodes(recording: Recording, env: Environment, *, where: str | os.PathLike[str], num_demos: int | None = None) -> Episodes:
     """A recording as the table that `load_demonstrations` makes of a file, with the same checks; `where` begins their messages."""
     where = Path(where)
     check_number(where, num_demos)
@@ -54,7 +54,7 @@ def padded(rows: Sequence[np.ndarray], num_rows: int) -> np.ndarray:
 
 
 def as_recording(
-    demonstrations: Episodes, env: RestorableEnvironment, *, env_args: dict[str, Any], expert: dict[str, Any] | None = None
+    demonstrations: Episodes, env: Environment, *, env_args: dict[str, Any], expert: dict[str, Any] | None = None
 ) -> Recording:
     """Episodes as a recording, without their padding.
 
@@ -68,7 +68,7 @@ def as_recording(
       ValueError: the episodes have no states, or not those of the environment.
     """
     given: Any = Episodes(**{field.name: cast(Any, np.asarray(getattr(demonstrations, field.name))) for field in dataclasses.fields(Episodes)})
-    expected = (*given.observations.shape[:2], env.state_dim)
+    expected = (*given.observations.shape[:2], state_dim(env))
     if given.states.shape != expected:
         raise ValueError(f"states must have shape {expected}, found {given.states.shape}")
     achieved_goals = np.asarray(env.achieved_goal(given.observations))
@@ -108,7 +108,7 @@ def check_lengths(path: Path, lengths: Sequence[int], horizon: int, num_demos: i
         warnings.warn(message, stacklevel=3)
 
 
-def check_against_env(path: Path, recording: Recording, env: RestorableEnvironment) -> None:
+def check_against_env(path: Path, recording: Recording, env: Environment) -> None:
     """Refuses a recording of another environment, of other arguments or dimensions, or with goals that the environment does not derive."""
     env_name, env_kwargs, demos = recording.env_name, recording.env_kwargs, recording.demonstrations
     if env.name not in (env_name, env_name.rpartition(":")[2]):  # the module of a task of the user's own may have moved
@@ -122,7 +122,7 @@ def check_against_env(path: Path, recording: Recording, env: RestorableEnvironme
                 raise UserError(
                     f"{path}: was recorded with {field} = {there}, but {env.name} here has {field} = {here}; use equal arguments or {RECORD_AGAIN}"
                 )
-    dims = {"observations": env.observation_dim, "actions": env.action_dim, "achieved_goals": env.goal_dim, "states": env.state_dim}
+    dims = {"observations": env.observation_dim, "actions": env.action_dim, "achieved_goals": env.goal_dim, "states": state_dim(env)}
     for demo in demos:
         for what, dim in dims.items():
             if getattr(demo, what) is not None and getattr(demo, what).shape[1] != dim:

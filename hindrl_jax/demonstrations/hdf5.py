@@ -34,7 +34,7 @@ from typing import Any
 
 import numpy as np
 
-from hindrl_jax.base.environments import RestorableEnvironment
+from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.files import check_can_write, write_atomically
 from hindrl_jax.base.types import Episodes
@@ -49,7 +49,7 @@ def save_demonstrations(
     path: str | os.PathLike[str],
     demonstrations: Episodes,
     *,
-    env: RestorableEnvironment,
+    env: Environment,
     env_args: dict[str, Any],
     expert: dict[str, Any] | None = None,
     overwrite: bool = False,
@@ -74,7 +74,7 @@ def save_demonstrations(
     write_recording(path, recording, env=env, overwrite=overwrite)
 
 
-def write_recording(path: str | os.PathLike[str], recording: Recording, *, env: RestorableEnvironment | None = None, overwrite: bool = False) -> None:
+def write_recording(path: str | os.PathLike[str], recording: Recording, *, env: Environment | None = None, overwrite: bool = False) -> None:
     """Writes a recording to `path`, as `save_demonstrations` does.
 
     Args:
@@ -102,7 +102,7 @@ def check_recording(recording: Recording, where: str | os.PathLike[str]) -> None
         read_all(Path(where), file)
 
 
-def load_demonstrations(path: str | os.PathLike[str], env: RestorableEnvironment, *, num_demos: int | None = None) -> Episodes:
+def load_demonstrations(path: str | os.PathLike[str], env: Environment, *, num_demos: int | None = None) -> Episodes:
     """Reads demonstrations as a table padded with zeros to the horizon of `env`, NumPy arrays throughout.
 
     Demonstrations longer than the horizon are dropped with a warning. They stand in the numeric order of their names.

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hindrl_jax.base.environments import RestorableEnvironment, action_to_env, compiler_options, on_host
+from hindrl_jax.base.environments import Environment, Restorable, action_to_env, can_step, compiler_options, state_dim
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.demonstrations._endings import cut_at_end, with_last_observation, zero_is_success
 from hindrl_jax.demonstrations._layout import layout
@@ -22,7 +22,7 @@ _ACTION_TOLERANCE = 1e-5
 _STATE_TOLERANCE = 1e-4
 
 
-def interpret(foreign: ForeignRecording, meaning: Interpretation, env: RestorableEnvironment | None) -> Recording:
+def interpret(foreign: ForeignRecording, meaning: Interpretation, env: Environment | None) -> Recording:
     """Makes a recording of what another tool has written.
 
     Args:
@@ -163,9 +163,9 @@ def _bound(where: str, given: tuple[float, ...], known: np.ndarray | None, actio
     return np.full(action_dim, default)
 
 
-def _last_state(env: RestorableEnvironment | None) -> Callable[..., Any] | None:
+def _last_state(env: Environment | None) -> Callable[..., Any] | None:
     """A program (state (S,), action (A,)) -> the next state (S,) and what is observed in it; None where that takes a simulator outside JAX."""
-    if env is None or on_host(env):
+    if not (can_step(env) and isinstance(env, Restorable)):
         return None
 
     def step(vector: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -175,12 +175,12 @@ def _last_state(env: RestorableEnvironment | None) -> Callable[..., Any] | None:
     return jax.jit(step, compiler_options=compiler_options(env))
 
 
-def _states(demo: Demonstration, env: RestorableEnvironment | None, last_state: Callable[..., Any] | None) -> np.ndarray | None:
+def _states(demo: Demonstration, env: Environment | None, last_state: Callable[..., Any] | None) -> np.ndarray | None:
     """(L + 1, S) states of our environment, if the source has them.
 
     robomimic keeps no state after the last action. It is had by taking that action once more, and only believed if it looks as observed.
     """
-    if env is None or demo.states is None or demo.states.ndim != 2 or demo.states.shape[1] != env.state_dim:
+    if env is None or demo.states is None or demo.states.ndim != 2 or demo.states.shape[1] != state_dim(env):
         return None
     if len(demo.states) == len(demo) + 1:
         return demo.states

@@ -14,7 +14,7 @@ from hindrl_jax.plotting.statistics import bootstrap_band
 if TYPE_CHECKING:
     from hindrl_jax.reporting.compare import Axis, RecordedRun
     from hindrl_jax.reproduction.ablation import Outcome
-    from hindrl_jax.training.experiment import Result
+    from hindrl_jax.training.result import Result
 
 _MEAN, _SEED, _DEMO = "#1f5fa8", "#9dbfe3", "#c77b00"
 _VERDICTS = {"better": "#1f5fa8", "worse": "#b3261e", "open": "0.5"}

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hindrl_jax.base.environments import RestorableEnvironment
+from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.extras import require
 from hindrl_jax.tasks.registry import viewer
@@ -33,7 +33,7 @@ def check_film(path: Path, num_episodes: int = 1) -> None:
         require("av.container", "write a .gif")
 
 
-def save_film(env: RestorableEnvironment, episodes: Sequence[Sequence[Any]], path: Path) -> None:
+def save_film(env: Environment, episodes: Sequence[Sequence[Any]], path: Path) -> None:
     """Draws episodes, one after the other, as a film: .gif or .mp4. As a .png, draws the last state alone.
 
     Args:

@@ -16,7 +16,7 @@ from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.base.files import disk_trouble
 from hindrl_jax.plotting.statistics import Interval, bootstrap, bootstrap_difference
 from hindrl_jax.runs.spec import CONFIG, METRICS, SUMMARY, RunSpec, read_spec
-from hindrl_jax.training.experiment import SOLVED
+from hindrl_jax.training.result import SOLVED
 
 Axis = Literal["steps", "updates", "seconds"]
 FEW_SEEDS = 8

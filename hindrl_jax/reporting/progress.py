@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from hindrl_jax.training.experiment import Result, Row
+from hindrl_jax.training.result import Result, Row
 
 _WIDTHS = (10, 30)  # the least and the most characters of the bar
 

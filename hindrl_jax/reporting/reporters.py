@@ -23,7 +23,7 @@ from hindrl_jax.base.extras import require
 
 if TYPE_CHECKING:
     from hindrl_jax.runs.spec import RunSpec
-    from hindrl_jax.training.experiment import Result, Row, SeedSummary
+    from hindrl_jax.training.result import Result, Row, SeedSummary
 
 
 class Reporter(abc.ABC):

@@ -22,7 +22,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from flax.traverse_util import flatten_dict
 
-from hindrl_jax.base.environments import RestorableEnvironment
+from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.base.files import disk_trouble
 from hindrl_jax.base.types import Episodes
@@ -33,7 +33,9 @@ from hindrl_jax.runs.spec import CONFIG, METRICS, SUMMARY, RunSpec, read_spec
 from hindrl_jax.runs.writer import RunWriter
 from hindrl_jax.tasks.presets import preset
 from hindrl_jax.tasks.registry import checked, make
-from hindrl_jax.training.experiment import Result, fit, record_demonstrations
+from hindrl_jax.training.experiment import fit
+from hindrl_jax.training.recording import record_demonstrations
+from hindrl_jax.training.result import Result
 
 TABLE, TEXT, PICTURE = "ablation.csv", "ablation.md", "ablation.png"
 Group = Literal["baseline", "algorithm", "hindsight", "goals", "targets", "demonstrations", "critic", "actor", "inputs", "replay", "rollout"]
@@ -351,7 +353,7 @@ def train(setting: Setting, *, report: Callable[[Result], None] = lambda result:
 
 
 @functools.lru_cache(maxsize=1)
-def _demonstrations(env: RestorableEnvironment, num_demos: int, seeds: tuple[int, ...]) -> tuple[Episodes, ...]:
+def _demonstrations(env: Environment, num_demos: int, seeds: tuple[int, ...]) -> tuple[Episodes, ...]:
     """One table per seed, kept for the next setting of the same task."""
     return tuple(record_demonstrations(env, num_demos, seed=seed) for seed in seeds)
 

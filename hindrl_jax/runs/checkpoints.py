@@ -29,7 +29,7 @@ import numpy as np
 from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.base.files import DAMAGED_ARCHIVE, read_arrays, write_atomically
 from hindrl_jax.base.types import Episodes
-from hindrl_jax.training.experiment import Result, Row
+from hindrl_jax.training.result import Result, Row
 
 LAYOUT = 1
 DEMONSTRATIONS = "demonstrations.npz"

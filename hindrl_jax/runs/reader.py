@@ -2,37 +2,28 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax.traverse_util import unflatten_dict
 
-from hindrl_jax.base.environments import RestorableEnvironment, action_to_env, compiler_options
+from hindrl_jax.base.environments import Environment, Restorable
 from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.base.files import DAMAGED_ARCHIVE, disk_trouble, read_arrays
+from hindrl_jax.base.steppers import Watchable
 from hindrl_jax.base.types import Episodes
-from hindrl_jax.core import rollout
-from hindrl_jax.core import train as training
 from hindrl_jax.core.agent import Policy
-from hindrl_jax.core.goals import GoalTable, sample_goals
+from hindrl_jax.core.goals import GoalTable
 from hindrl_jax.core.inputs import InputScale
 from hindrl_jax.plotting.films import check_film, save_film, save_pictures
 from hindrl_jax.runs.spec import PARAMETERS, RunSpec, read_spec
-from hindrl_jax.tasks.from_gymnasium import Simulators, is_gymnasium
 from hindrl_jax.tasks.registry import checked
-from hindrl_jax.training import host
-from hindrl_jax.training.devices import seed_mesh
-from hindrl_jax.training.recording import on_host, player
-
-if TYPE_CHECKING:
-    pass
+from hindrl_jax.training.playing import TrainedPolicies
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,60 +65,11 @@ class Run:
           report: called with the number of episodes played so far, all seeds together, where they are played one by one: in robosuite.
         """
         keys = jax.random.split(jax.random.key(0) if key is None else key, len(self.spec.seeds))
-        if is_gymnasium(self.spec.env):
-            result = self._play_in_gymnasium(keys, episodes, stochastic=stochastic)
-        elif on_host(self.spec.env):
-            result = self._play_one_by_one(keys, episodes, stochastic=stochastic, report=report)
-        else:
-            result = self._play_side_by_side(keys, episodes, stochastic=stochastic)
+        result = self._trained(stochastic).evaluate(keys, episodes, report)
         return [
             {"seed": seed, "success": float(result.success[i].mean()), "episode_length": float(result.length[i].mean())}
             for i, seed in enumerate(self.spec.seeds)
         ]
-
-    def _play_side_by_side(self, keys: jax.Array, episodes: int, *, stochastic: bool) -> rollout.Evaluation:
-        """All episodes of all seeds in one compiled program; leaves (S, episodes)."""
-        env, config = self.spec.env, self.spec.config
-
-        @jax.vmap
-        def play_episodes(key: jax.Array, policy: Policy, goals: GoalTable) -> rollout.Evaluation:
-            return rollout.evaluate(key, env, goals, training.make_policy(policy, env, config, stochastic=stochastic), episodes)
-
-        program = jax.jit(play_episodes, compiler_options=compiler_options(env))
-        return jax.device_get(program(keys, self.policies, self.behavioural_goals))
-
-    def _play_in_gymnasium(self, keys: jax.Array, episodes: int, *, stochastic: bool) -> rollout.Evaluation:
-        """Episodes of all seeds side by side, up to `num_envs` for each; leaves (S, episodes)."""
-        num_seeds = len(self.spec.seeds)
-        env: Any = self.spec.env
-        policies = host.Policies(env, self.spec.config, seed_mesh(num_seeds), stochastic=stochastic)
-        with contextlib.closing(Simulators(env, num_seeds * min(self.spec.config.num_envs, episodes))) as simulators:
-            return host.evaluate(keys, simulators, policies, self.policies, episodes)
-
-    def _play_one_by_one(self, keys: jax.Array, episodes: int, *, stochastic: bool, report: Callable[[int], None]) -> rollout.Evaluation:
-        """One episode after the other; leaves (S, episodes)."""
-        success: Any = np.zeros((len(keys), episodes), bool)
-        length: Any = np.zeros((len(keys), episodes), np.int32)
-        for i, key in enumerate(keys):
-            play_episode = player(self.spec.env, self._act(i, stochastic=stochastic, any_goal=True), 1)
-            for n, key_episode in enumerate(jax.random.split(key, episodes)):
-                outcome = play_episode(key_episode)
-                success[i, n], length[i, n] = outcome.terminated[0], outcome.lengths[0]
-                report(i * episodes + n + 1)
-        return rollout.Evaluation(success=success, length=length)
-
-    def _act(self, index: int, *, stochastic: bool, any_goal: bool) -> Callable[[jax.Array, Any, jax.Array], jax.Array]:
-        """The policy of one seed, for `player`. It aims at the first behavioural goal, or with `any_goal` at one drawn for the episode."""
-        env = self.spec.env
-        policy_of_seed, goals = jax.tree.map(lambda leaf: leaf[index], (self.policies, self.behavioural_goals))
-        policy = training.make_policy(policy_of_seed, env, self.spec.config, stochastic=stochastic)
-
-        def act(key: jax.Array, state: Any, observation: jax.Array) -> jax.Array:
-            # The state's key is constant within an episode, and so is the goal drawn with it.
-            goal = sample_goals(jax.random.fold_in(state.key, 0), goals, 1) if any_goal else goals.goals[:1]
-            return action_to_env(policy(key, observation[None], goal)[0], env)
-
-        return act
 
     def render(self, path: Path, *, seed: int | None = None, key: jax.Array | None = None, stochastic: bool = False) -> int:
         """Films fresh episodes of one seed's policy (the first seed's by default); returns how many of them solved the task.
@@ -145,27 +87,16 @@ class Run:
         keys = jnp.atleast_1d(jax.random.key(0) if key is None else key)
         check_film(path, len(keys))
         index = self._index_of(seed)
-        if is_gymnasium(env):
-            return self._film(path, index, keys, stochastic=stochastic)
-        play_episode = player(env, self._act(index, stochastic=stochastic, any_goal=False), 1)
+        trained = self._trained(stochastic)
+        if isinstance(env, Watchable):
+            pictures, num_solved = trained.film(keys, index)
+            with disk_trouble(path):
+                save_pictures(pictures, [1.0 / env.render_fps] * len(pictures), path)
+            return num_solved
+        play_episode = trained.player(index, 1)
         played = [jax.device_get(play_episode(key_episode)) for key_episode in keys]
         draw_episodes(path, env, [episodes.states[0, : int(episodes.lengths[0]) + 1] for episodes in played])
         return sum(bool(episodes.terminated[0]) for episodes in played)
-
-    def _film(self, path: Path, index: int, keys: jax.Array, *, stochastic: bool) -> int:
-        """`render` of an environment of Gymnasium, which draws itself."""
-        env: Any = self.spec.env
-        policy_of_seed = jax.tree.map(lambda leaf: leaf[index : index + 1], self.policies)
-        policies = host.Policies(env, self.spec.config, seed_mesh(1), stochastic=stochastic)
-        pictures, num_solved = [], 0
-        for key in keys:
-            key_seed, key_act = jax.random.split(key)
-            episode, solved = host.film(env, int(jax.random.bits(key_seed)), policies.acting(key_act[None], policy_of_seed))
-            pictures += episode
-            num_solved += solved
-        with disk_trouble(path):
-            save_pictures(pictures, [1.0 / env.description.render_fps] * len(pictures), path)
-        return num_solved
 
     def play(self, episodes: int = 1, *, seed: int | None = None, key: jax.Array | None = None, stochastic: bool = False) -> Episodes:
         """Plays fresh episodes with one seed's policy (the first seed's by default), to be looked at step by step; solved or not.
@@ -184,8 +115,10 @@ class Run:
         Raises:
           UserError: if the run has no such seed.
         """
-        act = self._act(self._index_of(seed), stochastic=stochastic, any_goal=False)
-        return player(self.spec.env, act, episodes)(jax.random.key(0) if key is None else key)
+        return self._trained(stochastic).play(jax.random.key(0) if key is None else key, self._index_of(seed), episodes)
+
+    def _trained(self, stochastic: bool) -> TrainedPolicies:
+        return TrainedPolicies(self.spec.env, self.spec.config, self.policies, self.behavioural_goals, stochastic)
 
     def _index_of(self, seed: int | None) -> int:
         """Where a seed, the first one by default, stands among those of the run."""
@@ -195,14 +128,14 @@ class Run:
         return self.spec.seeds.index(seed)
 
 
-def draw_episodes(path: Path, env: RestorableEnvironment, episodes: Sequence[np.ndarray]) -> None:
+def draw_episodes(path: Path, env: Environment, episodes: Sequence[np.ndarray]) -> None:
     """Draws episodes from their states (length + 1, S each): a film of them, one after the other, or as a PNG the last state.
 
     Raises:
       UserError: for another kind of file, a place that cannot be written, states of another environment, or one that nothing draws.
     """
     check_film(path, len(episodes))
-    if is_gymnasium(env):
+    if not isinstance(env, Restorable):
         raise UserError(f"demonstrations of {env.name} hold no states, so they cannot be drawn; `hindrl render` films the policies of a run")
     for states in episodes:
         if states.shape[-1] != env.state_dim:

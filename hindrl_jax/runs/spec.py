@@ -17,11 +17,11 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
-from hindrl_jax.base.environments import RestorableEnvironment
+from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.tasks.registry import did_you_mean, full_name, make
-from hindrl_jax.training.experiment import Row
+from hindrl_jax.training.result import Row
 
 if TYPE_CHECKING:
     pass
@@ -39,7 +39,7 @@ ROW_FIELDS = [field.name for field in dataclasses.fields(Row) if field.name != "
 class RunSpec:
     """Everything that a run was asked to do."""
 
-    env: RestorableEnvironment
+    env: Environment
     config: TrainConfig
     demos: str
     """A number of demonstrations to record for each seed, or the path of a file."""

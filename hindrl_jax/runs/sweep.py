@@ -19,7 +19,7 @@ from hindrl_jax.config import with_values
 from hindrl_jax.plotting import curves as plots
 from hindrl_jax.runs.spec import CHECKPOINTS, RUN_FILES, SWEEP, SWEEP_CURVES, SWEEP_SETTINGS, RunSpec, read_spec
 from hindrl_jax.runs.writer import RunWriter
-from hindrl_jax.training.experiment import Result
+from hindrl_jax.training.result import Result
 
 if TYPE_CHECKING:
     from hindrl_jax.reporting.reporters import Reporter

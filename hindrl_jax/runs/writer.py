@@ -31,12 +31,12 @@ from flax.traverse_util import flatten_dict
 
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.files import disk_trouble, why_unwritable, write_text_atomically
+from hindrl_jax.base.steppers import Watchable
 from hindrl_jax.plotting import curves as plots
 from hindrl_jax.runs.reader import load_run
 from hindrl_jax.runs.spec import CHECKPOINTS, CONFIG, CURVE, EPISODE, FROM_PYTHON, LOCK, METRICS, PARAMETERS, ROW_FIELDS, RUN_FILES, SUMMARY, RunSpec
-from hindrl_jax.tasks.from_gymnasium import is_gymnasium
 from hindrl_jax.tasks.registry import viewer
-from hindrl_jax.training.experiment import Result, Row
+from hindrl_jax.training.result import Result, Row
 
 if TYPE_CHECKING:
     from hindrl_jax.reporting.reporters import Reporter
@@ -135,7 +135,7 @@ class RunWriter:
         if film:
             try:
                 run = load_run(self.path)
-                if is_gymnasium(run.spec.env) or viewer(run.spec.env) is not None:
+                if isinstance(run.spec.env, Watchable) or viewer(run.spec.env) is not None:
                     run.render(self.path / EPISODE)
             except UserError as error:
                 warnings.warn(f"no {EPISODE}: {error}", stacklevel=2)

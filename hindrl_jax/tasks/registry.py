@@ -14,16 +14,22 @@ import sys
 from collections.abc import Callable
 from typing import Any, Literal
 
-from hindrl_jax.base.environments import RestorableEnvironment
+from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.errors import UserError
+from hindrl_jax.base.types import Array, Episodes
 from hindrl_jax.envs.grid import FixedGridPickAndPlace, GridPickAndPlace
 from hindrl_jax.envs.reach import FixedParameterizedReach, ParameterizedReach
 from hindrl_jax.experts import fetch
 from hindrl_jax.experts.grid import GridExpert
 from hindrl_jax.experts.reach import ReachExpert
+from hindrl_jax.experts.robosuite_arm import play_in_robosuite
 from hindrl_jax.tasks import from_gymnasium
 
 Family = Literal["grid", "reach", "gymnasium"]
+Act = Callable[[Array, Any, Array], Array]
+"""(key, state, observation (D,)) -> action (A,) in the environment's own units."""
+Player = Callable[[Array, Any, Act, int], Episodes]
+"""(key, environment, act, N) -> N episodes, played one after the other; `act` is compiled."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,15 +47,21 @@ class Task:
     """Which of the presets' recipes is for it."""
     summary: str
     """One line for the table of `hindrl envs`."""
+    player: Player | None = None
+    """What plays episodes with a back end that steps neither in JAX nor many at once; None where no back end needs it."""
 
+
+_GRID_VIEWER, _REACH_VIEWER = "hindrl_jax.envs.grid.viewer", "hindrl_jax.envs.reach.viewer"
 
 TASKS: dict[str, Task] = {
     task.environment.name: task
     for task in (
-        Task(GridPickAndPlace, GridExpert, "hindrl_jax.envs.grid.viewer", "grid", "objects, agent and goal anywhere on the grid (thesis 3.1.1)"),
-        Task(FixedGridPickAndPlace, GridExpert, "hindrl_jax.envs.grid.viewer", "grid", "each of them within a small box of its own (thesis 3.1.2)"),
-        Task(ParameterizedReach, ReachExpert, "hindrl_jax.envs.reach.viewer", "reach", "a Panda arm reaches random poses in order (thesis 3.2.1)"),
-        Task(FixedParameterizedReach, ReachExpert, "hindrl_jax.envs.reach.viewer", "reach", "the same, with poses that never change (thesis 3.2.2)"),
+        Task(GridPickAndPlace, GridExpert, _GRID_VIEWER, "grid", "objects, agent and goal anywhere on the grid (thesis 3.1.1)"),
+        Task(FixedGridPickAndPlace, GridExpert, _GRID_VIEWER, "grid", "each of them within a small box of its own (thesis 3.1.2)"),
+        Task(ParameterizedReach, ReachExpert, _REACH_VIEWER, "reach", "a Panda arm reaches random poses in order (thesis 3.2.1)", play_in_robosuite),
+        Task(
+            FixedParameterizedReach, ReachExpert, _REACH_VIEWER, "reach", "the same, with poses that never change (thesis 3.2.2)", play_in_robosuite
+        ),
     )
 }
 
@@ -64,8 +76,8 @@ def register(environment: type[Any], *, expert: type[Any] | None = None, viewer:
     calls `register`.
 
     Args:
-      environment: a frozen dataclass that fulfils `types.RestorableEnvironment` and whose name is a class variable: `name: ClassVar[str] = "Maze"`.
-        Its fields become options of the commands, and need defaults.
+      environment: a frozen dataclass that fulfils `base.environments.RestorableEnvironment` and whose name is a class variable:
+        `name: ClassVar[str] = "Maze"`. Its fields become options of the commands, and need defaults.
       expert: a frozen dataclass with a method act(key, env, state) -> (A,) action in the environment's own units; None if demonstrations come from
         elsewhere. Its fields become options of `hindrl demos record`.
       viewer: an object or module, or the name of a module, with save_png(env, state, path) and animation(env, states, captions=None), which returns
@@ -124,7 +136,7 @@ def task(name: str) -> Task:
     return TASKS[name]
 
 
-def full_name(env: RestorableEnvironment) -> str:
+def full_name(env: Environment) -> str:
     """The name by which `make` finds the environment again, in another process too: with its module unless it is this project's own."""
     module = type(env).__module__
     return env.name if env.name in _BUILT_IN or env.name not in TASKS or module == "__main__" else f"{module}:{env.name}"
@@ -143,7 +155,7 @@ def _import_from_here(module: str) -> None:
         sys.path.pop()
 
 
-def make(name: str, **arguments: Any) -> RestorableEnvironment:
+def make(name: str, **arguments: Any) -> Environment:
     """Builds an environment by name.
 
     Args:
@@ -164,7 +176,7 @@ def make(name: str, **arguments: Any) -> RestorableEnvironment:
     return checked(lambda: environment(**arguments))
 
 
-def viewer(env: RestorableEnvironment) -> Any:
+def viewer(env: Environment) -> Any:
     """What draws this environment; None if nothing does."""
     found = task(env.name).viewer
     return importlib.import_module(found) if isinstance(found, str) else found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -10,83 +11,48 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hindrl_jax.base.environments import RestorableEnvironment, action_from_env, compiler_options, on_host
+from hindrl_jax.base.environments import Environment, action_from_env, can_step
 from hindrl_jax.base.errors import UserError
-from hindrl_jax.base.types import Array, Episodes, tree_where
-from hindrl_jax.experts.robosuite_arm import play_in_robosuite
+from hindrl_jax.base.steppers import HostStepped, Watchable
+from hindrl_jax.base.types import Array, Episodes
+from hindrl_jax.tasks.registry import task
+from hindrl_jax.training.playing import player, plays_one_by_one
 
 Expert = Any
 """A frozen dataclass with a method act(key, env, state) -> (A,) action in the environment's own units."""
+Demonstrator = Callable[[Any, np.random.Generator], np.ndarray]
+"""(an observation as the environment's own code gives it, randomness) -> action (A,) in the environment's own units."""
 
 
-Act = Callable[[Array, Any, Array], Array]
-"""(key, state, observation (D,)) -> action (A,) in the environment's own units."""
-
-
-def play(key: Array, env: RestorableEnvironment, act: Act, num_episodes: int) -> Episodes:
-    """Plays episodes to their end, solved or not, and notes the states on the way, which are repeated after the end.
-
-    The desired goal of an episode is the goal that it reached at its end.
+def record_demonstrations(env: Environment, num_demos: int, *, seed: int = 0, expert: Any = None) -> Episodes:
+    """Records demonstrations with the task's own expert.
 
     Args:
-      key: random key.
-      env: static.
-      act: the policy.
-      num_episodes: N, played side by side.
-    """
-
-    def step(carry: tuple[Array, Any, Array, Array], _: None) -> tuple[tuple[Array, Any, Array, Array], tuple[Array, ...]]:
-        key, state, observation, over = carry
-        key, key_act = jax.random.split(key)
-        action = act(key_act, state, observation)
-        next_state, time_step = env.step(state, action)
-        next_state = tree_where(over, state, next_state)
-        next_observation = jnp.where(over, observation, time_step.observation)
-        done = jnp.clip(action_from_env(action, env), -1.0, 1.0)  # what the environment makes of an action beyond its bounds
-        row = (observation, env.state_to_vector(state), done, time_step.reward, over, time_step.terminated)
-        return (key, next_state, next_observation, over | time_step.terminated | time_step.truncated), row
-
-    def episode(key: Array) -> Episodes:
-        key_reset, key_play = jax.random.split(key)
-        state, observation = env.reset(key_reset)
-        start = (key_play, state, observation, jnp.asarray(False))
-        (_, state, observation, _), rows = jax.lax.scan(step, start, length=env.horizon)
-        observations, states, actions, rewards, over, terminated = rows
-        return Episodes(
-            observations=jnp.concatenate([observations, observation[None]]),
-            actions=actions,
-            rewards=jnp.where(over, 0.0, rewards),
-            lengths=jnp.sum(~over),
-            terminated=jnp.any(terminated & ~over),
-            desired_goals=env.achieved_goal(observation),
-            states=jnp.concatenate([states, env.state_to_vector(state)[None]]),
-        )
-
-    return jax.vmap(episode)(jax.random.split(key, num_episodes))
-
-
-def player(env: RestorableEnvironment, act: Act, num_episodes: int) -> Callable[[Array], Episodes]:
-    """`play` as a program, key -> episodes, on whatever simulates the environment. It is compiled once.
-
-    Args:
-      env, act, num_episodes: as for `play`.
+      env: from `make`.
+      num_demos: at least 1; only solved episodes are kept.
+      seed: equal seeds give equal demonstrations.
+      expert: another expert: a frozen dataclass with a method act(key, env, state), for Gymnasium's environments act(observation, rng).
 
     Raises:
-      UserError: from the program, if the environment is simulated by robosuite and that is missing or unusable.
+      UserError: if `num_demos` is below 1, the expert cannot solve the task within its horizon, or there is none.
     """
-    if on_host(env):
-        arm: Any = env
-        return lambda key: play_in_robosuite(key, arm, act, num_episodes)
-    return jax.jit(lambda key: play(key, env, act, num_episodes), compiler_options=compiler_options(env))
+    if expert is None:
+        expert_class = task(env.name).expert
+        if expert_class is None:
+            raise UserError(f"no expert is known for {env.name}: give one, or demonstrations from a file, which hindrl_jax.record_gymnasium can make")
+        expert = expert_class()
+    if not can_step(env) and isinstance(env, Watchable):
+        return record_gymnasium(env, expert.act, num_demos, seed=seed)
+    return record(jax.random.fold_in(jax.random.key(seed), 1), env, expert, num_demos)
 
 
 @functools.cache
-def _expert_player(env: RestorableEnvironment, expert: Expert, num_episodes: int) -> Callable[[Array], Episodes]:
+def _expert_player(env: Environment, expert: Expert, num_episodes: int) -> Callable[[Array], Episodes]:
     """`player` of an expert; cached because a run records for each of its seeds."""
     return player(env, lambda key, state, observation: expert.act(key, env, state), num_episodes)
 
 
-def record(key: Array, env: RestorableEnvironment, expert: Expert, num_demos: int, *, max_attempts: int | None = None) -> Episodes:
+def record(key: Array, env: Environment, expert: Expert, num_demos: int, *, max_attempts: int | None = None) -> Episodes:
     """Records `num_demos` demonstrations that solve the task; unsolved episodes are discarded.
 
     Args:
@@ -101,7 +67,7 @@ def record(key: Array, env: RestorableEnvironment, expert: Expert, num_demos: in
     if num_demos < 1:
         raise UserError(f"num_demos = {num_demos} is too few: record at least 1 demonstration")
     max_attempts = 100 * num_demos if max_attempts is None else max_attempts
-    batch_size = 1 if on_host(env) else max(num_demos, 16)
+    batch_size = 1 if plays_one_by_one(env) else max(num_demos, 16)
     play_batch = _expert_player(env, expert, batch_size)
     kept: list[Episodes] = []
     attempts = 0
@@ -117,3 +83,61 @@ def record(key: Array, env: RestorableEnvironment, expert: Expert, num_demos: in
         kept.append(jax.tree.map(lambda leaf, solved=batch.terminated: leaf[solved], batch))
         attempts += batch_size
     return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)[:num_demos]), *kept)
+
+
+def record_gymnasium(env: Watchable, policy: Demonstrator, num_demos: int, *, seed: int = 0, max_attempts: int | None = None) -> Episodes:
+    """Records demonstrations that reach their goals, each cut where it does; others are discarded.
+
+    Args:
+      env: for example from `hindrl_jax.make("gymnasium:...")`.
+      policy: from an observation, as the environment gives it, and a numpy generator, the action in the environment's own units.
+      num_demos: N, at least 1.
+      seed: equal seeds give equal demonstrations.
+      max_attempts: episodes to play before giving up; by default 100 times `num_demos`.
+
+    Raises:
+      UserError: if `num_demos` is below 1, or the policy reaches too few goals.
+    """
+    if num_demos < 1:
+        raise UserError(f"num_demos = {num_demos} is too few: record at least 1 demonstration")
+    max_attempts = 100 * num_demos if max_attempts is None else max_attempts
+    rng = np.random.default_rng(seed)
+    kept: list[Episodes] = []
+    with contextlib.closing(env.watched(with_pictures=False)) as stepper:
+        observation, goal = stepper.begin(rng.integers(2**32, size=1))
+        for _ in range(max_attempts):
+            observations, actions, ended = [observation], [], False
+            while not ended:
+                action = np.asarray(policy(stepper.raw_observation(), rng), np.float32)
+                actions.append(np.clip(action, env.action_low, env.action_high))
+                outcome = stepper.step(action[None])
+                observations.append(outcome.next_observation)
+                ended = outcome.ended[0]
+            if outcome.success[0]:
+                reached = np.asarray(env.achieved_goal(outcome.next_observation)) if goal is None else goal
+                kept.append(_demonstration(env, np.concatenate(observations), np.stack(actions), reached[0]))
+            observation, goal = outcome.observation, outcome.desired_goal
+            if len(kept) == num_demos:
+                return jax.tree.map(lambda *leaves: np.stack(leaves), *kept)
+    raise UserError(
+        f"the policy reached its goal in only {len(kept)} of {max_attempts} episodes of {env.name}, but {num_demos} demonstrations are wanted: "
+        "ask for fewer, or give a better one"
+    )
+
+
+def _demonstration(env: HostStepped, observations: np.ndarray, actions: np.ndarray, goal: np.ndarray) -> Episodes:
+    """A solved episode of L steps, padded: observations (L + 1, D), actions (L, A) in the environment's own units, goal (G,)."""
+    length = len(actions)
+
+    def padded(rows: np.ndarray, size: int) -> np.ndarray:
+        return np.concatenate([rows, np.zeros((size - len(rows), *rows.shape[1:]), np.float32)])
+
+    return Episodes(
+        observations=padded(observations, env.horizon + 1),
+        actions=padded(np.asarray(action_from_env(jnp.asarray(actions), env)), env.horizon),
+        rewards=np.eye(env.horizon, dtype=np.float32)[length - 1],
+        lengths=np.int32(length),
+        terminated=np.bool_(True),
+        desired_goals=goal,
+        states=np.zeros((env.horizon + 1, 0), np.float32),
+    )

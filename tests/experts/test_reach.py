@@ -11,7 +11,7 @@ from hindrl_jax.base.environments import action_to_env
 from hindrl_jax.envs import panda, rotations
 from hindrl_jax.envs.reach import FixedParameterizedReach, ParameterizedReach
 from hindrl_jax.experts.reach import ReachExpert
-from hindrl_jax.training.recording import play
+from hindrl_jax.training.playing import play
 
 ENV = FixedParameterizedReach()
 HAND = panda.posture(jnp.asarray(panda.INITIAL_JOINTS, jnp.float32))

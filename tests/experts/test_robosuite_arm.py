@@ -18,7 +18,8 @@ from hindrl_jax.envs.panda import closed_form
 from hindrl_jax.envs.reach import FixedParameterizedReach
 from hindrl_jax.experts.reach import ReachExpert
 from hindrl_jax.experts.robosuite_arm import play_episode, play_in_robosuite, shared_arm, stacked
-from hindrl_jax.training.recording import play, record
+from hindrl_jax.training.playing import play
+from hindrl_jax.training.recording import record
 
 ENV = FixedParameterizedReach(num_waypoints=2, backend="robosuite")
 IN_CLOSED_FORM = dataclasses.replace(ENV, backend="closed_form")

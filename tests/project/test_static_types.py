@@ -33,7 +33,7 @@ def test_mypy_knows_what_the_package_shows(tmp_path):
     assert [name for name, line in revealed.items() if 'is "Any"' in line] == []
     assert "def (env: " in revealed["fit"]
     assert "seeds: typing.Sequence[int]" in revealed["fit"].replace("collections.abc.", "typing.")
-    assert "-> hindrl_jax.training.experiment.Result" in revealed["fit"]
+    assert "-> hindrl_jax.training.result.Result" in revealed["fit"]
     assert 'Missing positional argument "config" in call to "fit"' in said
     assert 'Module has no attribute "fitt"' in said
 

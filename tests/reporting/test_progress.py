@@ -13,7 +13,7 @@ import hindrl_jax as hindrl
 from hindrl_jax.cli import training
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.reporting.progress import bar
-from hindrl_jax.training.experiment import Row
+from hindrl_jax.training.result import Row
 
 CONFIG = TrainConfig(steps=4_000)
 WIPE = "\r\x1b[2K"

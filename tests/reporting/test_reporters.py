@@ -14,7 +14,7 @@ import hindrl_jax as hindrl
 from hindrl_jax.base import extras
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.runs import writer as runs
-from hindrl_jax.training.experiment import Result, Row, SeedSummary
+from hindrl_jax.training.result import Result, Row, SeedSummary
 
 ENV = hindrl.make("FixedGridPickAndPlace")
 CONFIG = TrainConfig()

@@ -34,7 +34,7 @@ from hindrl_jax.reproduction.ablation import (
 from hindrl_jax.runs.spec import read_spec
 from hindrl_jax.tasks.presets import preset
 from hindrl_jax.tasks.registry import make
-from hindrl_jax.training.experiment import record_demonstrations
+from hindrl_jax.training.recording import record_demonstrations
 
 TINY = dataclasses.replace(CONFIG, steps=80, eval_episodes=100)
 SMALL = AblationTask("FixedGridPickAndPlace", (("num_objects", 1), ("size", 4), ("random_box_size", 1), ("horizon", 20)), 1)

@@ -15,7 +15,7 @@ import hindrl_jax as hindrl
 from hindrl_jax.config import SWEEPABLE, GoalConfig, sweepable_value, with_values
 from hindrl_jax.plotting import films
 from hindrl_jax.runs import writer as runs
-from hindrl_jax.training.experiment import Result, Row
+from hindrl_jax.training.result import Result, Row
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,8 @@ from hindrl_jax import cli
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.runs.checkpoints import Checkpoints
 from hindrl_jax.tasks.from_gymnasium import Simulators
-from hindrl_jax.training.host import play, record_gymnasium
+from hindrl_jax.training.host_playing import play
+from hindrl_jax.training.recording import record_gymnasium
 
 POINT = "gymnasium:point_env:PointGoal-v0"
 

@@ -1,0 +1,92 @@
+"""Environments that are stepped outside JAX, many at once, by whatever code they have: a simulator in C, or Python of somebody else's."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Protocol, TypeGuard, runtime_checkable
+
+import numpy as np
+
+from hindrl_jax.base.environments import Environment
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What a step of N environments has brought."""
+
+    next_observation: np.ndarray  # (N, D) float32, the true next one
+    success: np.ndarray  # (N,) bool, the task was solved by this step
+    terminated: np.ndarray  # (N,) bool, the episode is over, be it by success or by the environment's own rules
+    truncated: np.ndarray  # (N,) bool, the horizon cut it; never both
+    observation: np.ndarray  # (N, D) float32, where the environments are now: in a new episode, if the old one is over
+    desired_goal: np.ndarray | None  # (N, G) float32, of the episode in which they are now; None where episodes have no goals of their own
+
+    @property
+    def ended(self) -> np.ndarray:
+        """(N,) bool"""
+        return self.terminated | self.truncated
+
+
+class Stepper(Protocol):
+    """N environments side by side, each of which begins anew as soon as its episode ends."""
+
+    @property
+    def num_envs(self) -> int: ...
+
+    def begin(self, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+        """Begins an episode in each: seeds (N,) uint32 -> observations (N, D), and desired goals (N, G) or None, see `Outcome`."""
+
+    def step(self, actions: np.ndarray) -> Outcome:
+        """Takes one step of each: actions (N, A) in the environment's own units."""
+
+    def close(self) -> None:
+        """Ends the environments."""
+
+
+class WatchedStepper(Stepper, Protocol):
+    """One environment that somebody looks at: an expert at what it observes, a person at pictures."""
+
+    def step(self, actions: np.ndarray, *, begin_anew: bool = True) -> Outcome:
+        """As of `Stepper`, but a new episode begins only if it is to, so that the last state can be looked at."""
+
+    def raw_observation(self) -> Any:
+        """The present observation as the environment's own code gives it, for an expert."""
+
+    def picture(self) -> np.ndarray:
+        """A picture (H, W, 3) uint8 of the present state.
+
+        Raises:
+          UserError: if it draws none, or cannot draw here.
+        """
+
+
+@runtime_checkable
+class HostStepped(Environment, Protocol):
+    """An environment that is stepped outside JAX, many at once.
+
+    Where the choice of a back end decides whether it is, a property `steps_on_host` says so; ask with `can_step_on_host`.
+    """
+
+    @property
+    def gives_goals(self) -> bool:
+        """Whether each of its episodes comes with a goal of its own, rather than with a behavioural goal from the demonstrations."""
+
+    def stepper(self, num_envs: int) -> Stepper:
+        """That many environments side by side."""
+
+
+@runtime_checkable
+class Watchable(HostStepped, Protocol):
+    """A host-stepped environment that can be watched: by an expert who demonstrates it, and, as it draws itself, by a person."""
+
+    @property
+    def render_fps(self) -> int:
+        """Steps shown per second of a film."""
+
+    def watched(self, *, with_pictures: bool) -> WatchedStepper:
+        """One environment, in this process."""
+
+
+def can_step_on_host(env: Any) -> TypeGuard[HostStepped]:
+    """Whether the environment can be stepped outside JAX, many at once, with the back end that it has now."""
+    return isinstance(env, HostStepped) and getattr(env, "steps_on_host", True)

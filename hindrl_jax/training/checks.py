@@ -1,0 +1,145 @@
+"""What is refused before anything is computed: environments, configs, seeds and demonstrations that do not go together.
+
+A refusal names the ability that is missing, see `hindrl_jax.base.environments`, and what to do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from hindrl_jax.base.environments import Environment, Restorable, RelabelsObservations, backends_with, can_step
+from hindrl_jax.base.errors import UserError
+from hindrl_jax.base.steppers import can_step_on_host
+from hindrl_jax.base.types import Episodes
+from hindrl_jax.config import SWEEPABLE, TrainConfig, sweepable_value, with_traced_values
+from hindrl_jax.core.train import warm_up_iterations
+
+
+def can_train(env: Any) -> bool:
+    """Whether many episodes can be played side by side, in JAX or outside."""
+    return can_step(env) or can_step_on_host(env)
+
+
+def check_trainable(env: Environment) -> None:
+    """Makes sure that the environment can be stepped many at once, as it has to be to learn in.
+
+    Raises:
+      UserError: if not.
+    """
+    if can_train(env):
+        return
+    others = backends_with(env, can_train)
+    if others:
+        raise UserError(
+            f"{env.name} cannot be trained with backend = {getattr(env, 'backend', None)}, which steps one environment at a time outside JAX: "
+            f"train with backend {' or '.join(others)}"
+        )
+    raise UserError(f"{env.name} cannot be trained: it has neither reset and step in JAX, nor a stepper of many environments outside it")
+
+
+def check_config(env: Environment, config: TrainConfig) -> None:
+    """Makes sure that the environment can give what the config asks for.
+
+    Raises:
+      UserError: if not.
+    """
+    name, goal = env.name, config.goal
+    in_jax = can_step(env)
+    gives_goals = not in_jax and can_step_on_host(env) and env.gives_goals
+    if gives_goals and goal.behavioural_goals != "environment":
+        raise UserError(
+            f"behavioural_goals = {goal.behavioural_goals} cannot be had in {name}, whose episodes come with goals of their own: choose environment"
+        )
+    if not gives_goals and goal.behavioural_goals == "environment":
+        raise UserError(f"behavioural_goals = environment cannot be had in {name}, which gives its episodes no goals: choose another")
+    if isinstance(env, RelabelsObservations):
+        if config.batch.uses_intersections:
+            raise UserError(f"joint_intersection compares goals, and hindsight changes none in {name}: choose another hindrl_sampling_strategy")
+        if goal.has_achieved_goals:
+            raise UserError(f"achieved_goal_ratio is for tasks with other goals than their own, which {name} has not: set it to 0")
+    if config.demo_reset_ratio > 0.0 and not (in_jax and isinstance(env, Restorable)):
+        missing = "restorable states" if in_jax else "restorable states in JAX"
+        raise UserError(f"{name} cannot begin in demonstrated states: it has no {missing}: set demo_reset_ratio to 0")
+    if not in_jax:
+        for field, value, off in (("random_truncation", config.random_truncation, 0.0), ("agent_resets", config.agent_resets, ())):
+            if value:
+                raise UserError(f"{field} = {value} needs a step in JAX, which {name} does not have: set it to {off}")
+
+
+def steps_to_learn(env: Environment, config: TrainConfig) -> int:
+    """What is left of `config.steps` after the random steps at the start.
+
+    Raises:
+      UserError: if nothing is.
+    """
+    at_random = warm_up_iterations(env, config) * config.num_envs if config.learns_from_rollouts else 0
+    if config.steps <= at_random:
+        raise UserError(f"steps = {config.steps} ends within the {at_random} random steps before learning: raise steps")
+    return config.steps - at_random
+
+
+def check_seeds(seeds: Sequence[int]) -> None:
+    """Makes sure that there is a seed, and that all can be had.
+
+    Raises:
+      UserError: if not.
+    """
+    if not seeds or not all(0 <= seed < 2**32 for seed in seeds):
+        raise UserError(f"seeds = {list(seeds)} is not usable: give at least one whole number from 0 to {2**32 - 1}")
+
+
+def demonstrations_per_seed(demonstrations: Episodes | Sequence[Episodes], seeds: Sequence[int], env: Environment) -> Episodes:
+    """Stacks one table per seed, numpy leaves (S, ...). States are kept if every table has them.
+
+    Raises:
+      UserError: if the tables do not fit the seeds and the environment.
+    """
+    tables = _one_for_each(seeds, demonstrations, Episodes, "tables of demonstrations")
+    expected = (env.horizon + 1, env.observation_dim, env.horizon, env.action_dim)
+    for table in tables:
+        found = table.observations.shape[1:] + table.actions.shape[1:]
+        if found != expected or table.observations.shape[0] < 1 or table.observations.shape != (len(tables[0].lengths), *found[:2]):
+            raise UserError(
+                f"demonstrations of shapes {table.observations.shape} and {table.actions.shape} do not fit {env.name}: it takes one or more, "
+                f"as many for each seed, with observations (N, {expected[0]}, {expected[1]}) and actions (N, {expected[2]}, {expected[3]})"
+            )
+        states = table.states
+        if states is not None and isinstance(env, Restorable) and states.shape != (*table.observations.shape[:2], env.state_dim):
+            raise UserError(f"demonstrated states of shape {states.shape} are not those of {env.name}, which has {env.state_dim}: record again")
+    if any(table.states is None for table in tables):
+        tables = tuple(table.replace(states=None) for table in tables)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *jax.device_get(tables))
+
+
+def configs_per_seed(config: TrainConfig | Sequence[TrainConfig], seeds: Sequence[int]) -> tuple[TrainConfig, ...]:
+    """One config per seed.
+
+    Raises:
+      UserError: if one program cannot serve them all.
+    """
+    configs = _one_for_each(seeds, config, TrainConfig, "configs")
+    swept = swept_fields(configs)
+    for other in configs[1:]:
+        if with_traced_values(configs[0], {name: sweepable_value(other, name) for name in swept}) != other:
+            raise UserError(f"configs of one experiment may differ only in {', '.join(SWEEPABLE)}; these differ in more: run them apart")
+    for name in swept:
+        if any(sweepable_value(config, name) is None for config in configs):
+            raise UserError(f"{name} is None in some configs and a number in others: give numbers only")
+    return configs
+
+
+def swept_fields(configs: Sequence[TrainConfig]) -> list[str]:
+    """The fields of `config.SWEEPABLE` in which the configs differ."""
+    return [name for name in SWEEPABLE if len({sweepable_value(config, name) for config in configs}) > 1]
+
+
+def _one_for_each(seeds: Sequence[int], given: Any, kind: type[Any], noun: str) -> tuple[Any, ...]:
+    """What was given for all seeds, repeated, or for each of them."""
+    items = (given,) * len(seeds) if isinstance(given, kind) else tuple(given)
+    if len(items) != len(seeds):
+        raise UserError(f"{len(items)} {noun} for {len(seeds)} seeds: give one for all, or one for each")
+    return items

@@ -1,0 +1,146 @@
+"""Playing with policies in environments that are stepped outside JAX: evaluations and films."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+
+from hindrl_jax.base.environments import Environment, action_to_env
+from hindrl_jax.base.steppers import HostStepped, Outcome, Stepper, WatchedStepper
+from hindrl_jax.base.types import Array
+from hindrl_jax.config import TrainConfig
+from hindrl_jax.core.agent import Policy
+from hindrl_jax.core.goals import GoalTable
+from hindrl_jax.core.rollout import Evaluation
+from hindrl_jax.core.train import make_policy
+from hindrl_jax.training.devices import by_seed, over_seeds
+
+HostAct = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""(observations (N, D), desired goals (N, G)) -> actions (N, A) in the environment's own units."""
+
+
+class HostPolicies:
+    """The policies of S seeds as one compiled program, for any number of environments each."""
+
+    def __init__(self, env: Environment, config: TrainConfig, mesh: Mesh, *, stochastic: bool):
+        def act(key: Array, actor: Policy, observation: Array, desired_goal: Array) -> tuple[Array, Array]:
+            key, key_act = jax.random.split(key)
+            action = make_policy(actor, env, config, stochastic=stochastic)(key_act, observation, desired_goal)
+            return key, action_to_env(action, env)
+
+        self._mesh, self._program = mesh, jax.jit(over_seeds(act, mesh))
+
+    def acting(self, key: Array, actor: Policy) -> HostAct:
+        """A function of what all environments observe, those of the first seed first; it draws from the keys (S,)."""
+
+        def act(observation: np.ndarray, desired_goal: np.ndarray) -> np.ndarray:
+            nonlocal key
+            inputs = jax.device_put([array.reshape(len(key), -1, array.shape[1]) for array in (observation, desired_goal)], by_seed(self._mesh))
+            key, action = self._program(key, actor, *inputs)
+            return np.asarray(action).reshape(len(observation), -1)
+
+        return act
+
+
+class _BehaviouralGoals:
+    """A stepper whose environments give no goals, which gives each episode one of its run's behavioural goals."""
+
+    def __init__(self, stepper: Stepper, goals: GoalTable):
+        self._stepper, self._goals, self._counts = stepper, np.asarray(goals.goals), np.asarray(goals.count)
+        self.num_envs = stepper.num_envs
+
+    def begin(self, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        observation, _ = self._stepper.begin(seeds)
+        self._randomness = [np.random.default_rng(of_run) for of_run in seeds.reshape(len(self._goals), -1)]
+        self._now = self._draw()
+        return observation, self._now
+
+    def step(self, actions: np.ndarray) -> Outcome:
+        outcome = self._stepper.step(actions)
+        self._now = np.where(outcome.ended[:, None], self._draw(), self._now)
+        return dataclasses.replace(outcome, desired_goal=self._now)
+
+    def close(self) -> None:
+        self._stepper.close()
+
+    def _draw(self) -> np.ndarray:
+        """(N, G)"""
+        num_envs = self.num_envs // len(self._goals)
+        tables = zip(self._goals, self._counts, self._randomness, strict=True)
+        return np.concatenate([goals[rng.integers(count, size=num_envs)] for goals, count, rng in tables])
+
+
+def with_goals_of(stepper: Stepper, env: HostStepped, goals: GoalTable) -> Stepper:
+    """A stepper whose episodes have goals: their own, or else behavioural ones from the tables of S runs, leaves (S, ...)."""
+    return stepper if env.gives_goals else _BehaviouralGoals(stepper, goals)
+
+
+def evaluate(key: Array, stepper: Stepper, policies: HostPolicies, actor: Policy, num_episodes: int) -> Evaluation:
+    """Plays fresh episodes with each seed's policy, numpy leaves (S, num_episodes).
+
+    Args:
+      key: (S,) keys; equal ones give equal episodes.
+      stepper: as many environments for each seed.
+      policies: what acts.
+      actor: leaves (S, ...).
+      num_episodes: for each seed; shared out evenly between its environments, whatever their lengths.
+    """
+    key_seeds, key_act = (jax.vmap(jax.random.fold_in, (0, None))(key, index) for index in (0, 1))
+    num_envs = stepper.num_envs // len(key)
+    seeds = np.asarray(jax.vmap(lambda key: jax.random.bits(key, (num_envs,)))(key_seeds))
+    success, length = play(stepper, seeds.reshape(-1), policies.acting(key_act, actor), -(-num_episodes // num_envs))
+    # Episode n of a seed is the (n // E)-th of its environment n % E.
+    ordered = (array.reshape(len(key), num_envs, -1).swapaxes(1, 2).reshape(len(key), -1)[:, :num_episodes] for array in (success, length))
+    return Evaluation(success=next(ordered), length=next(ordered))
+
+
+def play(stepper: Stepper, seeds: np.ndarray, act: HostAct, num_episodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Plays that many episodes in each environment.
+
+    Args:
+      stepper: N environments.
+      seeds: (N,) uint32.
+      act: the policy.
+      num_episodes: K; what an environment does after its K-th, while others are not done, does not count.
+
+    Returns:
+      (N, K) bool, whether the task was solved, and (N, K) int32, how many steps it took.
+    """
+    success, length = (np.zeros((stepper.num_envs, num_episodes), kind) for kind in (bool, np.int32))
+    played, steps = (np.zeros(stepper.num_envs, np.int32) for _ in range(2))
+    observation, goal = stepper.begin(seeds)
+    while (played < num_episodes).any():
+        outcome = stepper.step(act(observation, goal))
+        observation, goal = outcome.observation, outcome.desired_goal
+        steps += 1
+        over = np.flatnonzero(outcome.ended & (played < num_episodes))
+        success[over, played[over]], length[over, played[over]] = outcome.success[over], steps[over]
+        played[over] += 1
+        steps[outcome.ended] = 0
+    return success, length
+
+
+def film(stepper: WatchedStepper, seed: int, act: HostAct, behavioural_goal: np.ndarray) -> tuple[list[np.ndarray], bool]:
+    """Plays one episode: a picture (H, W, 3) uint8 of each state, and whether the task was solved.
+
+    Args:
+      stepper: one environment.
+      seed: which episode.
+      act: the policy.
+      behavioural_goal: (1, G), in the place of a goal of the episode's own where it has none.
+
+    Raises:
+      UserError: if the environment draws no pictures.
+    """
+    observation, goal = stepper.begin(np.array([seed]))
+    pictures = [stepper.picture()]
+    while True:
+        outcome = stepper.step(act(observation, behavioural_goal if goal is None else goal), begin_anew=False)
+        pictures.append(stepper.picture())
+        if outcome.ended[0]:
+            return pictures, bool(outcome.success[0])
+        observation, goal = outcome.observation, outcome.desired_goal

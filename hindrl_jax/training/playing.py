@@ -1,0 +1,192 @@
+"""Playing episodes, with an expert or with trained policies, on whatever steps the environment."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hindrl_jax.base.environments import Environment, RestorableEnvironment, Steppable, action_from_env, action_to_env, can_step, compiler_options
+from hindrl_jax.base.errors import UserError
+from hindrl_jax.base.steppers import HostStepped, Watchable, can_step_on_host
+from hindrl_jax.base.types import Array, Episodes, tree_where
+from hindrl_jax.config import TrainConfig
+from hindrl_jax.core import rollout
+from hindrl_jax.core.agent import Policy
+from hindrl_jax.core.goals import GoalTable, sample_goals
+from hindrl_jax.core.rollout import Evaluation
+from hindrl_jax.core.train import make_policy
+from hindrl_jax.tasks.registry import Act, task
+from hindrl_jax.training import host_playing
+from hindrl_jax.training.devices import seed_mesh
+
+
+def play(key: Array, env: RestorableEnvironment, act: Act, num_episodes: int) -> Episodes:
+    """Plays episodes to their end, solved or not, and notes the states on the way, which are repeated after the end.
+
+    The desired goal of an episode is the goal that it reached at its end.
+
+    Args:
+      key: random key.
+      env: static.
+      act: the policy.
+      num_episodes: N, played side by side.
+    """
+
+    def step(carry: tuple[Array, Any, Array, Array], _: None) -> tuple[tuple[Array, Any, Array, Array], tuple[Array, ...]]:
+        key, state, observation, over = carry
+        key, key_act = jax.random.split(key)
+        action = act(key_act, state, observation)
+        next_state, time_step = env.step(state, action)
+        next_state = tree_where(over, state, next_state)
+        next_observation = jnp.where(over, observation, time_step.observation)
+        done = jnp.clip(action_from_env(action, env), -1.0, 1.0)  # what the environment makes of an action beyond its bounds
+        row = (observation, env.state_to_vector(state), done, time_step.reward, over, time_step.terminated)
+        return (key, next_state, next_observation, over | time_step.terminated | time_step.truncated), row
+
+    def episode(key: Array) -> Episodes:
+        key_reset, key_play = jax.random.split(key)
+        state, observation = env.reset(key_reset)
+        start = (key_play, state, observation, jnp.asarray(False))
+        (_, state, observation, _), rows = jax.lax.scan(step, start, length=env.horizon)
+        observations, states, actions, rewards, over, terminated = rows
+        return Episodes(
+            observations=jnp.concatenate([observations, observation[None]]),
+            actions=actions,
+            rewards=jnp.where(over, 0.0, rewards),
+            lengths=jnp.sum(~over),
+            terminated=jnp.any(terminated & ~over),
+            desired_goals=env.achieved_goal(observation),
+            states=jnp.concatenate([states, env.state_to_vector(state)[None]]),
+        )
+
+    return jax.vmap(episode)(jax.random.split(key, num_episodes))
+
+
+def plays_one_by_one(env: Environment) -> bool:
+    """Whether episodes are played one after the other, by code of the task's own, since the back end steps neither in JAX nor many at once."""
+    return not can_step(env) and not can_step_on_host(env)
+
+
+def player(env: Environment, act: Act, num_episodes: int) -> Callable[[Array], Episodes]:
+    """`play` as a program, key -> episodes, on whatever steps the environment. It is compiled once.
+
+    Args:
+      env, act, num_episodes: as for `play`.
+
+    Raises:
+      UserError: if nothing plays episodes of this environment with their states; from the program, if its back end is missing or unusable.
+    """
+    if can_step(env):
+        steppable: Any = env
+        return jax.jit(lambda key: play(key, steppable, act, num_episodes), compiler_options=compiler_options(env))
+    play_one_by_one = task(env.name).player
+    if play_one_by_one is None:
+        raise UserError(f"{env.name} cannot be played with its states: it has no step in JAX")
+    return lambda key: play_one_by_one(key, env, act, num_episodes)
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainedPolicies:
+    """The policies of S runs, and what it takes to play them."""
+
+    env: Environment
+    config: TrainConfig
+    policies: Policy
+    """Leaves (S, ...)."""
+    behavioural_goals: GoalTable
+    """Leaves (S, ...)."""
+    stochastic: bool = False
+    """Sample the actions, instead of taking the mean ones."""
+
+    def evaluate(self, keys: Array, num_episodes: int, report: Callable[[int], None] = lambda played: None) -> Evaluation:
+        """Plays fresh episodes with each policy; leaves (S, num_episodes).
+
+        Args:
+          keys: (S,) which.
+          num_episodes: of each policy.
+          report: called with the number of episodes played so far, all policies together, where they are played one by one.
+        """
+        if can_step(self.env):
+            return self._evaluate_in_jax(self.env, keys, num_episodes)
+        if can_step_on_host(self.env):
+            return self._evaluate_on_host(self.env, keys, num_episodes)
+        return self._evaluate_one_by_one(keys, num_episodes, report)
+
+    def play(self, key: Array, index: int, num_episodes: int) -> Episodes:
+        """Plays fresh episodes with one policy, to be looked at step by step. It aims at the first behavioural goal.
+
+        Raises:
+          UserError: as `player`.
+        """
+        return self.player(index, num_episodes)(key)
+
+    def player(self, index: int, num_episodes: int, *, any_goal: bool = False) -> Callable[[Array], Episodes]:
+        """`player` of one policy. It aims at the first behavioural goal, or with `any_goal` at one drawn for the episode."""
+        env = self.env
+        policy, goals = jax.tree.map(lambda leaf: leaf[index], (self.policies, self.behavioural_goals))
+        choose = make_policy(policy, env, self.config, stochastic=self.stochastic)
+
+        def act(key: Array, state: Any, observation: Array) -> Array:
+            # The state's key is constant within an episode, and so is the goal drawn with it.
+            goal = sample_goals(jax.random.fold_in(state.key, 0), goals, 1) if any_goal else goals.goals[:1]
+            return action_to_env(choose(key, observation[None], goal)[0], env)
+
+        return player(env, act, num_episodes)
+
+    def film(self, keys: Array, index: int) -> tuple[list[np.ndarray], int]:
+        """Plays episodes in an environment that draws itself: pictures (H, W, 3) uint8 of all states, and how many episodes are solved.
+
+        Args:
+          keys: (N,) which episodes.
+          index: of the policy.
+
+        Raises:
+          UserError: if the environment draws no pictures.
+        """
+        if not isinstance(self.env, Watchable):
+            raise UserError(f"{self.env.name} does not draw itself: play it, and draw the states")
+        policy, goals = jax.tree.map(lambda leaf: leaf[index : index + 1], (self.policies, self.behavioural_goals))
+        host_policies = host_playing.HostPolicies(self.env, self.config, seed_mesh(1), stochastic=self.stochastic)
+        first_goal, pictures, num_solved = np.asarray(goals.goals[0, :1]), [], 0
+        for key in keys:
+            key_seed, key_act = jax.random.split(key)
+            act = host_policies.acting(key_act[None], policy)
+            with contextlib.closing(self.env.watched(with_pictures=True)) as stepper:
+                episode, solved = host_playing.film(stepper, int(jax.random.bits(key_seed)), act, first_goal)
+            pictures += episode
+            num_solved += solved
+        return pictures, num_solved
+
+    def _evaluate_in_jax(self, env: Steppable, keys: Array, num_episodes: int) -> Evaluation:
+        """All episodes of all policies in one compiled program."""
+
+        @jax.vmap
+        def play_episodes(key: Array, policy: Policy, goals: GoalTable) -> Evaluation:
+            return rollout.evaluate(key, env, goals, make_policy(policy, env, self.config, stochastic=self.stochastic), num_episodes)
+
+        program = jax.jit(play_episodes, compiler_options=compiler_options(env))
+        return jax.device_get(program(keys, self.policies, self.behavioural_goals))
+
+    def _evaluate_on_host(self, env: HostStepped, keys: Array, num_episodes: int) -> Evaluation:
+        """Episodes of all policies side by side, up to `num_envs` for each."""
+        policies = host_playing.HostPolicies(env, self.config, seed_mesh(len(keys)), stochastic=self.stochastic)
+        with contextlib.closing(env.stepper(len(keys) * min(self.config.num_envs, num_episodes))) as stepper:
+            with_goals = host_playing.with_goals_of(stepper, env, self.behavioural_goals)
+            return host_playing.evaluate(keys, with_goals, policies, self.policies, num_episodes)
+
+    def _evaluate_one_by_one(self, keys: Array, num_episodes: int, report: Callable[[int], None]) -> Evaluation:
+        success: Any = np.zeros((len(keys), num_episodes), bool)
+        length: Any = np.zeros((len(keys), num_episodes), np.int32)
+        for index, key in enumerate(keys):
+            play_episode = self.player(index, 1, any_goal=True)
+            for number, key_episode in enumerate(jax.random.split(key, num_episodes)):
+                outcome = play_episode(key_episode)
+                success[index, number], length[index, number] = outcome.terminated[0], outcome.lengths[0]
+                report(index * num_episodes + number + 1)
+        return Evaluation(success=success, length=length)

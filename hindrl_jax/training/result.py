@@ -1,0 +1,133 @@
+"""What an experiment leaves: evaluations, summaries, and the state of all its runs."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import numpy as np
+
+from hindrl_jax.base.environments import Environment
+from hindrl_jax.base.types import Array
+from hindrl_jax.config import TrainConfig
+from hindrl_jax.core.guidance import Guidance
+from hindrl_jax.core.train import TrainState
+
+SOLVED = 0.95
+"""Share of an evaluation's episodes from which on a task counts as learned."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One evaluation of one seed."""
+
+    seed: int
+    env_steps: int
+    updates: int
+    seconds: float
+    """Wall-clock training time of the whole run up to here, evaluations included, compilation not."""
+    success: float
+    """Share of the evaluation's episodes that solved the task."""
+    episode_length: float
+    """Mean number of steps of those episodes."""
+    metrics: dict[str, float]
+    """Losses and values, averaged over the gradient steps since the last evaluation."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SeedSummary:
+    """What became of one seed. The threshold of 95% refers to the evaluations along the run; None where it was never reached."""
+
+    seed: int
+    final_success: float
+    """Share of 100 fresh episodes that the final policy solves."""
+    best_success: float
+    """The best evaluation, the final one included."""
+    env_steps_to_95: int | None
+    updates_to_95: int | None
+    seconds_to_95: float | None
+    """Wall-clock time of the whole run, all its seeds side by side."""
+    episode_length: float
+    """Mean length of the 100 fresh episodes."""
+
+
+@dataclasses.dataclass
+class Result:
+    """An experiment, finished or under way: S runs side by side."""
+
+    env: Environment
+    configs: tuple[TrainConfig, ...]
+    """(S,) the config of each run."""
+    seeds: tuple[int, ...]
+    """(S,) the seed of each run."""
+    guidance: Guidance
+    """Leaves (S, ...)."""
+    state: TrainState
+    """Leaves (S, ...); the policies' parameters are `state.agent.average_actor`. While the run is under way the next chunk consumes it."""
+    rows: list[Row]
+    """In order of time, S rows per evaluation, in order of the runs."""
+    compile_seconds: float
+    train_seconds: float = 0.0
+    """Wall-clock time so far, evaluations included, compilation not."""
+    env_steps: int = 0
+    """Environment steps of each run so far."""
+    updates: int = 0
+    """Gradient steps of each run so far."""
+    final_success: np.ndarray | None = None
+    """(S,) share of 100 fresh episodes that the final policies solve; None while the run is under way."""
+    final_length: np.ndarray | None = None
+    """(S,) mean length of those episodes."""
+    key: Array | None = None
+    """(S,) keys of the evaluations to come."""
+    chunks: list[dict[str, np.ndarray]] = dataclasses.field(default_factory=list)
+    """Metrics, leaves (S,), of the chunks since the last evaluation."""
+
+    @property
+    def config(self) -> TrainConfig:
+        """The config of the first run; of all runs, unless `fit` was given several configs."""
+        return self.configs[0]
+
+    @property
+    def steps_done(self) -> int:
+        """What `TrainConfig.steps` counts: environment steps of each run so far; for behaviour cloning, gradient steps."""
+        return self.env_steps if self.config.learns_from_rollouts else self.updates
+
+    def latest_success(self) -> float | None:
+        """Success of the newest evaluation, averaged over runs; None before the first."""
+        newest = self.rows[-len(self.seeds) :]
+        return float(np.mean([row.success for row in newest])) if newest else None
+
+    def summaries(self) -> list[SeedSummary]:
+        """One summary per run of a finished experiment."""
+        return [self._summary(index, seed) for index, seed in enumerate(self.seeds)]
+
+    def rows_of(self, runs: slice) -> list[Row]:
+        """The rows of some of the runs, in order of time."""
+        return [row for start in range(0, len(self.rows), len(self.seeds)) for row in self.rows[start : start + len(self.seeds)][runs]]
+
+    def part(self, runs: slice) -> Result:
+        """The finished experiment as if about some of its runs only; but times, and all of the state except the agent, are those of all."""
+        guidance, agent = jax.tree.map(lambda leaf: leaf[runs], jax.device_get((self.guidance, self.state.agent)))
+        return dataclasses.replace(
+            self,
+            configs=self.configs[runs],
+            seeds=self.seeds[runs],
+            guidance=guidance,
+            state=self.state.replace(agent=agent),
+            rows=self.rows_of(runs),
+            final_success=self.final_success[runs],
+            final_length=self.final_length[runs],
+        )
+
+    def _summary(self, index: int, seed: int) -> SeedSummary:
+        rows = self.rows[index :: len(self.seeds)]
+        first = next((row for row in rows if row.success >= SOLVED), None)
+        return SeedSummary(
+            seed=seed,
+            final_success=float(self.final_success[index]),
+            best_success=max(float(self.final_success[index]), *(row.success for row in rows)),
+            env_steps_to_95=None if first is None else first.env_steps,
+            updates_to_95=None if first is None else first.updates,
+            seconds_to_95=None if first is None else first.seconds,
+            episode_length=float(self.final_length[index]),
+        )
