@@ -58,9 +58,7 @@ def read(source: str, meaning: Interpretation | None = None, env: Environment | 
     return understand(open_source(source), source, meaning, env)
 
 
-def understand(
-    found: ForeignRecording | Recording, source: str, meaning: Interpretation | None = None, env: Environment | None = None
-) -> Recording:
+def understand(found: ForeignRecording | Recording, source: str, meaning: Interpretation | None = None, env: Environment | None = None) -> Recording:
     """The second half of `read`, for what `open_source` has found."""
     if isinstance(found, Recording):
         if meaning not in (None, Interpretation()):

@@ -53,9 +53,7 @@ def padded(rows: Sequence[np.ndarray], num_rows: int) -> np.ndarray:
     return out
 
 
-def as_recording(
-    demonstrations: Episodes, env: Environment, *, env_args: dict[str, Any], expert: dict[str, Any] | None = None
-) -> Recording:
+def as_recording(demonstrations: Episodes, env: Environment, *, env_args: dict[str, Any], expert: dict[str, Any] | None = None) -> Recording:
     """Episodes as a recording, without their padding.
 
     Args:
