@@ -104,8 +104,8 @@ class Restorable(Environment, Protocol):
 
 
 def state_dim(env: Environment) -> int:
-    """Length of the vectors of a `Restorable` environment's states; 0 for another, which has none."""
-    return env.state_dim if isinstance(env, Restorable) else 0
+    """S, the length of the vectors of a `Restorable` environment's states; 0 for one that has none."""
+    return getattr(env, "state_dim", 0)
 
 
 @runtime_checkable

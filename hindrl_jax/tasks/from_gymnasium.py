@@ -91,11 +91,6 @@ class GymnasiumEnv:
         return self.description.action_high
 
     @property
-    def state_dim(self) -> int:
-        """0: there are no states."""
-        return 0
-
-    @property
     def render_fps(self) -> int:
         return self.description.render_fps
 

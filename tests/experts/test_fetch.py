@@ -6,8 +6,8 @@ import pytest
 import hindrl_jax as hindrl
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.experts.fetch import FetchPickAndPlaceExpert, FetchReachExpert
-from hindrl_jax.tasks.from_gymnasium import Simulators
 from hindrl_jax.tasks.registry import task
+from hindrl_jax.tasks.simulators import Simulators
 
 pytest.importorskip("gymnasium_robotics")
 

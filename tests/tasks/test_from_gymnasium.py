@@ -10,8 +10,8 @@ from point_env import SPEED
 import hindrl_jax as hindrl
 from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.errors import UserError
-from hindrl_jax.tasks import from_gymnasium
-from hindrl_jax.tasks.from_gymnasium import Simulators
+from hindrl_jax.tasks import simulators as simulation
+from hindrl_jax.tasks.simulators import Simulators
 
 POINT = "gymnasium:point_env:PointGoal-v0"
 
@@ -33,7 +33,7 @@ def simulators():
 def test_it_is_an_environment_like_others():
     env = hindrl.make(POINT)
     assert isinstance(env, Environment)
-    assert (env.name, env.horizon, env.observation_dim, env.goal_dim, env.action_dim, env.state_dim) == (POINT, 10, 5, 2, 2, 0)
+    assert (env.name, env.horizon, env.observation_dim, env.goal_dim, env.action_dim) == (POINT, 10, 5, 2, 2)
     np.testing.assert_array_equal([env.action_low, env.action_high], [[-2, -2], [2, 2]])
     np.testing.assert_array_equal(env.achieved_goal(jnp.arange(10.0).reshape(2, 5)), [[3, 4], [8, 9]])
     np.testing.assert_allclose(env.goal_tolerance, [0.2 / 2**0.5] * 2)  # the square within a circle of radius 0.2
@@ -48,7 +48,7 @@ def test_arguments_go_to_gymnasium_and_survive_the_way_through_a_file():
     assert hindrl.make(env.name, **dataclasses.asdict(env)) == env
     assert hindrl.make(POINT, make_kwargs=["says=reward"]).arguments == {"says": "reward"}  # a list, as JSON has it
     for word, value in (("False", False), ("false", False), ("None", None), ("null", None), ("3", 3), ("Falsely", "Falsely")):
-        assert from_gymnasium._arguments((f"says={word}",)) == {"says": value}
+        assert simulation.arguments_of((f"says={word}",)) == {"says": value}
 
 
 @pytest.mark.parametrize(

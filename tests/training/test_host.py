@@ -5,14 +5,20 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+import tiny
+from host_env import HostCorridor
 from PIL import Image
 from point_env import CONFIG, SPEED, to_goal
+from toy_env import corridor_demonstrations
 
 import hindrl_jax as hindrl
 from hindrl_jax import cli
 from hindrl_jax.base.errors import UserError
+from hindrl_jax.config import PriorityConfig
+from hindrl_jax.core.batch import JUDGED_BY_GOAL
+from hindrl_jax.core.hindsight import NEARBY_GOAL
 from hindrl_jax.runs.checkpoints import Checkpoints
-from hindrl_jax.tasks.from_gymnasium import Simulators
+from hindrl_jax.tasks.simulators import Simulators
 from hindrl_jax.training.host_playing import play
 from hindrl_jax.training.recording import record_gymnasium
 
@@ -88,7 +94,7 @@ def check_replay(replay, *, at_least):
 def test_the_replay_holds_what_the_environments_went_through(trained):
     replay = jax.device_get(trained.state.replay)
     check_replay(replay, at_least=40)
-    assert not np.array_equal(*replay.episodes.observations)  # each seed lives its own episodes
+    assert not np.array_equal(*replay.episodes.observations)  # each seed has its own episodes
 
 
 def test_a_run_is_told_like_others(trained):
@@ -143,7 +149,10 @@ def test_a_run_by_the_command_line_can_be_played_and_filmed(env, demonstrations,
         (["demos", "render", str(file)], "hold no states"),
         (["train", "--env", POINT, "--demos", "1"], "no expert is known"),
         (["demos", "record", "--env", POINT, "--demos", "1", "--out", str(tmp_path / "x.hdf5")], "no expert is known"),
-        (["train", "--env", POINT, "--demos", str(file), "--demo-reset-ratio", "0.5"], "states are not known"),
+        (
+            ["train", "--env", POINT, "--demos", str(file), "--demo-reset-ratio", "0.5"],
+            "it has no restorable states in JAX: set",
+        ),
         (["eval", str(out), "--backend", "robosuite"], "one back end"),
     ]:
         with pytest.raises(SystemExit):
@@ -160,27 +169,32 @@ def test_cloning_needs_no_environment_but_to_be_judged(env):
     assert result.final_success[0] > 0.6
 
 
-def test_other_levers_work_as_well(env, demonstrations):
+def test_other_options_work_as_well(env, demonstrations):
     """All at once, since each would be compiled for long."""
-    batch = dict(priority_exponent=0.5, hindrl_sampling_strategy="mixture", strategy_mixture=(("joint_intersection", 1.0), ("future", 1.0)))
+    batch = dict(hindrl_sampling_strategy="mixture", strategy_mixture=(("joint_intersection", 1.0), ("future", 1.0)))
+    priority = PriorityConfig(priority_exponent=0.5)
     goal = dataclasses.replace(CONFIG.goal, achieved_goal_ratio=0.5)
-    config = dataclasses.replace(with_batch(CONFIG, **batch), goal=goal, bc_warm_start=3, pretrain_updates=4, steps=120)
+    config = dataclasses.replace(with_batch(CONFIG, **batch), goal=goal, priority=priority, bc_warm_start=3, steps=120)
     result = hindrl.fit(env, demonstrations, config)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(jax.device_get(result.state.agent)))
     replay = jax.device_get(result.state.replay)
-    assert result.updates == 3 + 4 + 2 * (result.env_steps - 40) // 4
-    assert (replay.nearby_goals >= 0).any()
+    assert result.updates == 3 + 2 * (result.env_steps - 40) // 4
+    assert (replay.notes[NEARBY_GOAL] >= 0).any()
     complete = replay.episodes.lengths[0] > 0
-    assert 0.1 < replay.judged_by_goal[0, complete].mean() < 0.9  # the goals of these episodes were chosen here, and kept
+    assert 0.1 < replay.notes[JUDGED_BY_GOAL][0, complete].mean() < 0.9  # the goals of these episodes were chosen here, and kept
     assert len(np.unique(replay.episodes.desired_goals[0, complete], axis=0)) == complete.sum()
 
 
 def test_what_cannot_be_had_is_refused(env, demonstrations):
     own = hindrl.make("FixedGridPickAndPlace")
     for where, config, message in [
-        (env, dataclasses.replace(CONFIG, demo_reset_ratio=0.5), "whose states are not known"),
-        (env, dataclasses.replace(CONFIG, random_truncation=0.1), r"random_truncation = 0\.1 is for environments in JAX"),
-        (env, dataclasses.replace(CONFIG, agent_resets=(0.5,)), "agent_resets = .* is for environments in JAX"),
+        (env, dataclasses.replace(CONFIG, demo_reset_ratio=0.5), "cannot begin in demonstrated states: it has no restorable states in JAX"),
+        (
+            env,
+            dataclasses.replace(CONFIG, random_truncation=0.1),
+            r"random_truncation = 0\.1 needs a step in JAX, which .* does not have: set it to 0",
+        ),
+        (env, dataclasses.replace(CONFIG, agent_resets=(0.5,)), r"agent_resets = .* needs a step in JAX, which .* set it to \(\)"),
         (env, dataclasses.replace(CONFIG, goal=dataclasses.replace(CONFIG.goal, behavioural_goals="task")), "choose environment"),
         (own, CONFIG, "gives its episodes no goals"),
     ]:
@@ -191,3 +205,40 @@ def test_what_cannot_be_had_is_refused(env, demonstrations):
         hindrl.record_demonstrations(env, 1)
     with pytest.raises(UserError, match="choose default"):
         hindrl.preset("hindrl", "thesis", env=env)
+
+
+CORRIDOR = dataclasses.replace(tiny.CONFIG, steps=120, learning_starts=10, num_envs=3, buffer_size=300)
+
+
+def check_goals(result, goals):
+    """Each episode aims at one of the goals, in every seed; and each of the goals is aimed at."""
+    episodes = jax.device_get(result.state.replay.episodes)
+    for seed, lengths in enumerate(episodes.lengths):
+        found = episodes.desired_goals[seed, lengths > 0, 0]
+        assert set(np.unique(found)) == set(np.float32(goals))
+
+
+def test_goals_are_behavioural_ones_where_an_environment_gives_none(tmp_path):
+    """An environment of one's own, whose episodes only say what they observe: aimed at the ends of the demonstrations, or at the task's goal."""
+    env, demonstrations = HostCorridor(), corridor_demonstrations(speeds=(1.0, 1.75))
+    result = hindrl.fit(env, demonstrations, CORRIDOR, seeds=[3, 4])
+    check_goals(result, [4.0, 3.5])
+    episodes = jax.device_get(result.state.replay.episodes)
+    starts = episodes.observations[..., 0][episodes.lengths > 0]
+    for row, length in enumerate(episodes.lengths[episodes.lengths > 0]):
+        assert len(np.unique(starts[row, : length + 1])) == 1  # the start of an episode stays as it is
+    assert result.final_success.shape == (2,)
+    assert all(stepper.closed for stepper in HostCorridor.made)
+
+    task = dataclasses.replace(CORRIDOR, goal=dataclasses.replace(CORRIDOR.goal, behavioural_goals="task"))
+    checkpoints = Checkpoints(tmp_path, seconds=0.0)
+
+    def stop(report):
+        checkpoints.save_when_due(report)
+        if report.env_steps > 60:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        hindrl.fit(env, demonstrations, task, report=stop)
+    assert all(stepper.closed for stepper in HostCorridor.made)
+    check_goals(hindrl.fit(env, demonstrations, task, restore=checkpoints.restore), [3.0])

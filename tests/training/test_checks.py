@@ -1,0 +1,111 @@
+"""What is refused before anything is computed, in a line that names what is missing and what to do."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import pytest
+from host_env import HostCorridor
+from tiny import CONFIG, ENV
+from toy_env import Corridor
+
+import hindrl_jax as hindrl
+from hindrl_jax.config import with_values
+from hindrl_jax.training.checks import check_config, check_trainable
+
+
+@pytest.fixture(scope="module")
+def demonstrations():
+    return hindrl.record_demonstrations(ENV, 2)
+
+
+@pytest.mark.parametrize(
+    ("configs", "message"),
+    [
+        ([CONFIG], "1 configs for 2 seeds"),
+        ([CONFIG, dataclasses.replace(CONFIG, num_envs=4)], "may differ only in union_sampling_ratio, gamma"),
+        ([CONFIG, with_values(CONFIG, {"final_learning_rate": 1e-3})], "final_learning_rate is None in some"),
+    ],
+)
+def test_configs_that_need_programs_of_their_own_are_refused(configs, message, demonstrations):
+    with pytest.raises(hindrl.UserError, match=message):
+        hindrl.fit(ENV, demonstrations, configs, seeds=[0, 1])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seeds": []}, "at least one"),
+        ({"seeds": [-1]}, "at least one whole number"),
+        ({"tables": 1, "seeds": [0, 1]}, "1 tables of demonstrations for 2 seeds"),
+        ({"env": hindrl.make("FixedGridPickAndPlace", size=4, random_box_size=1, horizon=21)}, "do not fit"),
+        ({"config": dataclasses.replace(CONFIG, steps=40)}, "steps = 40 ends within the 40 random steps"),
+        ({"config": dataclasses.replace(CONFIG, buffer_size=79)}, "buffer_size = 79"),
+    ],
+)
+def test_what_does_not_fit_is_refused(changes, message, demonstrations):
+    given = SimpleNamespace(**({"env": ENV, "config": CONFIG, "seeds": [0], "tables": None} | changes))
+    tables = demonstrations if given.tables is None else [demonstrations] * given.tables
+    with pytest.raises(hindrl.UserError, match=message):
+        hindrl.fit(given.env, tables, given.config, seeds=given.seeds)
+
+
+def test_goals_cannot_be_compared_where_hindsight_changes_none():
+    env = hindrl.make("ParameterizedReach", num_waypoints=1)
+    config = hindrl.preset("hindrl", env=env)
+    batch = dataclasses.replace(config.batch, hindrl_sampling_strategy="joint_intersection")
+    with pytest.raises(hindrl.UserError, match="joint_intersection compares goals"):
+        hindrl.fit(env, hindrl.record_demonstrations(env, 1), dataclasses.replace(config, batch=batch), seeds=[0])
+    goal = dataclasses.replace(config.goal, achieved_goal_ratio=0.5)
+    with pytest.raises(hindrl.UserError, match="achieved_goal_ratio is for tasks"):
+        hindrl.fit(env, hindrl.record_demonstrations(env, 1), dataclasses.replace(config, goal=goal), seeds=[0])
+
+
+class Unstepped(HostCorridor):
+    """It has a stepper, but not with the back end that it has now."""
+
+    steps_on_host = False
+
+
+def test_an_environment_that_cannot_be_stepped_many_at_once_is_refused():
+    check_trainable(ENV)
+    check_trainable(HostCorridor())
+    with pytest.raises(hindrl.UserError, match=r"with backend = robosuite, .* at a time outside JAX: train with backend closed_form or mjx"):
+        check_trainable(hindrl.make("ParameterizedReach", backend="robosuite"))
+    with pytest.raises(hindrl.UserError, match="HostCorridor cannot be trained: it has neither reset and step in JAX, nor a stepper"):
+        check_trainable(Unstepped())
+
+
+class Unrestorable:
+    """A corridor whose states cannot be written down."""
+
+    def __init__(self):
+        for name in ("name", "horizon", "observation_dim", "goal_dim", "action_dim", "action_low", "action_high"):
+            setattr(self, name, getattr(Corridor(), name))
+        self.achieved_goal, self.task_goal, self.reset, self.step = (getattr(Corridor(), n) for n in ("achieved_goal", "task_goal", "reset", "step"))
+        self.__dataclass_fields__ = {}
+
+
+def with_goals(behavioural_goals):
+    return dataclasses.replace(CONFIG, goal=dataclasses.replace(CONFIG.goal, behavioural_goals=behavioural_goals))
+
+
+@pytest.mark.parametrize(
+    ("env", "config", "message"),
+    [
+        (Unrestorable(), dataclasses.replace(CONFIG, demo_reset_ratio=0.5), "it has no restorable states: set demo_reset_ratio to 0"),
+        (HostCorridor(), dataclasses.replace(CONFIG, demo_reset_ratio=0.5), "it has no restorable states in JAX: set demo_reset_ratio to 0"),
+        (HostCorridor(), dataclasses.replace(CONFIG, agent_resets=(0.5,)), "needs a step in JAX, which HostCorridor does not have"),
+        (HostCorridor(), with_goals("environment"), "HostCorridor, which gives its episodes no goals: choose another"),
+        (ENV, with_goals("environment"), "FixedGridPickAndPlace, which gives its episodes no goals: choose another"),
+        (hindrl.make("gymnasium:point_env:PointGoal-v0"), with_goals("task"), "whose episodes come with goals of their own: choose environment"),
+    ],
+)
+def test_an_ability_that_is_missing_is_named(env, config, message):
+    with pytest.raises(hindrl.UserError, match=message):
+        check_config(env, config)
+
+
+def test_goals_need_not_be_the_environments_where_it_gives_none():
+    for goals in ("task", "final_demonstration_states"):
+        check_config(HostCorridor(), with_goals(goals))
+        check_config(ENV, with_goals(goals))

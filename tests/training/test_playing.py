@@ -1,0 +1,74 @@
+"""Playing by ability: in JAX, on the host, or one episode after the other."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from host_env import HostCorridor
+from tiny import CONFIG, ENV
+from toy_env import Corridor, corridor_demonstrations
+
+import hindrl_jax as hindrl
+from hindrl_jax.core import train
+from hindrl_jax.core.guidance import guidance
+from hindrl_jax.tasks.registry import TASKS
+from hindrl_jax.training.playing import TrainedPolicies, player
+
+
+def trained(env, demonstrations, **changes):
+    """Two untrained policies, and what they aim at."""
+    config = dataclasses.replace(CONFIG, algo="bc", **changes)
+    table = demonstrations.replace(states=None)
+
+    def begin(key):
+        data = guidance(table, env, config)
+        begun = train.RolloutState(env_state=(), observation=None, desired_goal=None, notes={})
+        return train.agents.policy(train.init(key, data, env, config, begun=begun).agent, average=True), data.behavioural_goals
+
+    return TrainedPolicies(env, config, *jax.vmap(begin)(jax.random.split(jax.random.key(0), 2)))
+
+
+def test_evaluations_are_alike_wherever_an_environment_is_stepped():
+    keys = jax.random.split(jax.random.key(1), 2)
+    outcomes = [trained(env, corridor_demonstrations()).evaluate(keys, 5) for env in (Corridor(), HostCorridor())]
+    for outcome in outcomes:
+        assert outcome.success.shape == outcome.length.shape == (2, 5)
+        assert (outcome.success | (outcome.length == 5)).all()
+        assert (outcome.length >= 2).all()  # 3 are walked in no less than 2 steps of 2
+    assert outcomes[0].success.any() == outcomes[1].success.any()
+    again = trained(HostCorridor(), corridor_demonstrations()).evaluate(keys, 5)
+    np.testing.assert_array_equal(again.length, outcomes[1].length)
+    assert all(stepper.closed for stepper in HostCorridor.made)
+
+
+def test_what_steps_neither_in_jax_nor_many_at_once_is_played_by_the_tasks_own_player(monkeypatch):
+    """With closed_form in the place of robosuite."""
+
+    def play(key, env, act, num_episodes):
+        played.append((env.backend, num_episodes))
+        return player(dataclasses.replace(env, backend="closed_form"), act, num_episodes)(key)
+
+    played, reported = [], []
+    env = hindrl.make("FixedParameterizedReach", num_waypoints=1, horizon=4)
+    demonstration = hindrl.record_demonstrations(dataclasses.replace(env, position_tolerance=9.0, rotation_tolerance=9.0), 1)
+    elsewhere = dataclasses.replace(env, backend="robosuite")
+    monkeypatch.setitem(TASKS, env.name, dataclasses.replace(TASKS[env.name], player=play))
+    policies = trained(elsewhere, demonstration)
+    outcome = policies.evaluate(jax.random.split(jax.random.key(1), 2), 3, reported.append)
+    assert outcome.length.tolist() == [[4] * 3] * 2
+    assert reported == [1, 2, 3, 4, 5, 6]
+    assert played == [("robosuite", 1)] * 6
+    episodes = policies.play(jax.random.key(0), 1, 2)
+    expected = dataclasses.replace(policies, env=env).play(jax.random.key(0), 1, 2)
+    jax.tree.map(np.testing.assert_array_equal, episodes, expected)
+
+
+def test_what_has_no_states_is_not_played_with_them():
+    with pytest.raises(hindrl.UserError, match="PointGoal-v0 cannot be played with its states: it has no step in JAX"):
+        player(hindrl.make("gymnasium:point_env:PointGoal-v0"), lambda key, state, observation: observation, 1)
+
+
+def test_only_what_draws_itself_is_filmed():
+    with pytest.raises(hindrl.UserError, match="FixedGridPickAndPlace does not draw itself"):
+        trained(ENV, hindrl.record_demonstrations(ENV, 1)).film(jax.random.split(jax.random.key(0), 1), 0)

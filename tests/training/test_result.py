@@ -1,0 +1,34 @@
+"""What an experiment leaves: the thresholds of its summary."""
+
+import numpy as np
+import pytest
+from tiny import CONFIG, ENV
+
+from hindrl_jax.training.result import Result, Row
+
+
+def row(seed, env_steps, success):
+    return Row(seed=seed, env_steps=env_steps, updates=env_steps // 10, seconds=env_steps / 100, success=success, episode_length=9.0, metrics={})
+
+
+def test_summary_takes_the_first_evaluation_at_95_percent():
+    rows = [row(1, 100, 0.94), row(2, 100, 0.5), row(1, 200, 0.95), row(2, 200, 0.6), row(1, 300, 0.9), row(2, 300, 0.7)]
+    result = Result(
+        env=ENV,
+        configs=(CONFIG, CONFIG),
+        seeds=(1, 2),
+        guidance=None,
+        state=None,
+        rows=rows,
+        compile_seconds=1.0,
+        train_seconds=3.0,
+        env_steps=300,
+        final_success=np.array([0.91, 0.8]),
+        final_length=np.array([8.0, 10.0]),
+    )
+    reached, never = result.summaries()
+    assert (reached.env_steps_to_95, reached.updates_to_95, reached.seconds_to_95) == (200, 20, 2.0)
+    assert (reached.best_success, reached.final_success, reached.episode_length) == (0.95, 0.91, 8.0)
+    assert (never.env_steps_to_95, never.updates_to_95, never.seconds_to_95) == (None, None, None)
+    assert never.best_success == 0.8  # the final evaluation counts
+    assert result.latest_success() == pytest.approx(0.8)
