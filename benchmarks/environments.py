@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import hindrl_jax
 from benchmarks import report, timing
 from benchmarks.timing import Contestant, Options, Row
-from hindrl_jax.base.environments import Environment, action_to_env
+from hindrl_jax.base.environments import Steppable, action_to_env
 from hindrl_jax.base.types import Array
 from hindrl_jax.core import rollout
 from hindrl_jax.core.goals import constant_goal
@@ -37,7 +37,7 @@ def run(options: Options) -> list[Row]:
     return rows
 
 
-def stepper(env: Environment, num_envs: int, *, resets: bool, num_actions: int = NUM_ACTIONS, steps_per_call: int = STEPS_PER_CALL) -> Contestant:
+def stepper(env: Steppable, num_envs: int, *, resets: bool, num_actions: int = NUM_ACTIONS, steps_per_call: int = STEPS_PER_CALL) -> Contestant:
     """Steps `num_envs` environments in one compiled loop.
 
     With resets this is `rollout.step`, which goes on from one of the new episodes of `rollout.reset` where one has ended; without, the bare steps,

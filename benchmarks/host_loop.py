@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import numpy as np
@@ -12,10 +13,10 @@ import hindrl_jax
 from benchmarks import report, timing
 from benchmarks.timing import Contestant, Options, Row
 from hindrl_jax.base.errors import UserError
+from hindrl_jax.base.steppers import Outcome, Stepper
 from hindrl_jax.base.types import Episodes
 from hindrl_jax.config import TrainConfig
-from hindrl_jax.core import train as training
-from hindrl_jax.tasks.from_gymnasium import GymnasiumEnv, Outcome, Simulators
+from hindrl_jax.tasks.from_gymnasium import GymnasiumEnv
 from hindrl_jax.training.devices import spread
 from hindrl_jax.training.host import HostPrograms
 
@@ -54,8 +55,8 @@ def run(options: Options) -> list[Row]:
     for num_envs in NUM_ENVS[:1] if options.quick else NUM_ENVS:
         contestants: dict[tuple[str, str], Contestant] = {}
         for mode, env in envs.items():
-            whole, program, simulators = loops(env, demonstrations, num_envs)
-            contestants["environments", mode] = timing.calls(stepping(simulators), units=num_envs)
+            whole, program, stepper = loops(env, demonstrations, num_envs)
+            contestants["environments", mode] = timing.calls(stepping(env, stepper), units=num_envs)
             contestants["loop", mode] = timing.calls(whole, units=num_envs)
             if mode == "sync":
                 contestants["program", ""] = timing.calls(program, units=num_envs)
@@ -68,40 +69,39 @@ def run(options: Options) -> list[Row]:
 
 
 def config_of(env: GymnasiumEnv, num_envs: int) -> TrainConfig:
-    """The default recipe with a gradient step for each step of an environment."""
-    return dataclasses.replace(hindrl_jax.preset("hindrl", env=env), num_envs=num_envs, updates_per_iteration=num_envs, learning_starts=0)
+    """The default recipe with a gradient step for each step of an environment, and one iteration between two reports."""
+    return dataclasses.replace(
+        hindrl_jax.preset("hindrl", env=env), num_envs=num_envs, updates_per_iteration=num_envs, learning_starts=0, eval_every=10 * num_envs
+    )
 
 
-def loops(env: GymnasiumEnv, demonstrations: Episodes, num_envs: int) -> tuple[Callable[[], None], Callable[[], None], Simulators]:
+def loops(env: GymnasiumEnv, demonstrations: Episodes, num_envs: int) -> tuple[Callable[[], None], Callable[[], None], Stepper]:
     """An iteration of the whole loop, one without environments, and environments that no loop has."""
-    config = config_of(env, num_envs)
     tables = jax.tree.map(lambda leaf: np.stack([leaf]), jax.device_get(demonstrations).replace(states=None))
-    programs = HostPrograms(env, [config], tables, {}, chunk=1, warm_up=training.warm_up_iterations(env, config))
-    seeds, tables = spread((np.zeros(1, np.uint32), tables), programs.mesh)
-    guidance, state, _ = programs.start(seeds, tables, {})
-    state = programs.collect(state, guidance, {})
-    lived, spare = programs.simulators, Simulators(env, num_envs)
+    programs = HostPrograms(env, [config_of(env, num_envs)], tables)
+    guidance, state, _ = programs.start(*spread((np.zeros(1, np.uint32), tables), programs.mesh))
+    state = programs.collect(state, guidance)
+    real, spare = programs.stepper, env.stepper(num_envs)
     observation, goal = spare.begin(np.arange(num_envs))
     never, ended = np.zeros(num_envs, bool), np.ones(num_envs, bool)
     moved = Outcome(next_observation=observation, success=never, terminated=never, truncated=ended, observation=observation, desired_goal=goal)
 
-    def iteration(simulators: Simulators | Motionless) -> Callable[[], None]:
+    def iteration(stepper: Any) -> Callable[[], None]:
         def call() -> None:
             nonlocal state
-            programs.simulators = simulators
-            state, _ = programs.learn(state, guidance, {})
+            programs.stepper = stepper
+            state, _ = programs.learn(state, guidance)
             jax.block_until_ready(state)
 
         return call
 
-    return iteration(lived), iteration(Motionless(moved)), spare
+    return iteration(real), iteration(Motionless(moved)), spare
 
 
-def stepping(simulators: Simulators) -> Callable[[], None]:
+def stepping(env: GymnasiumEnv, stepper: Stepper) -> Callable[[], None]:
     """A step of each environment at random."""
-    env, rng = simulators.env, np.random.default_rng(0)
-    shape = (simulators.num_envs, env.action_dim)
-    return lambda: simulators.step(rng.uniform(env.action_low, env.action_high, shape)) and None
+    rng, shape = np.random.default_rng(0), (stepper.num_envs, env.action_dim)
+    return lambda: stepper.step(rng.uniform(env.action_low, env.action_high, shape)) and None
 
 
 def versions(options: Options) -> dict[str, str]:

@@ -9,17 +9,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from hindrl_jax.core.priorities import Priorities
 from jax.sharding import Mesh
 
 import hindrl_jax
-from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.types import Array, Transition
-from hindrl_jax.config import BatchConfig, TrainConfig
-from hindrl_jax.core import priorities, replay
+from hindrl_jax.config import TrainConfig
 from hindrl_jax.core import train as training
-from hindrl_jax.core.train import Guidance, TrainState
+from hindrl_jax.core.batch import sample_batch
+from hindrl_jax.core.guidance import Guidance, guidance
+from hindrl_jax.core.train import TrainState
+from hindrl_jax.training import prioritised
 from hindrl_jax.training.devices import over_seeds, spread
+from hindrl_jax.training.prioritised import Priorities, sampler_for
 
 _RUN_ONCE = {"xla_backend_optimization_level": 0}  # for a program whose compilation takes longer than its one run
 
@@ -44,10 +45,11 @@ class Loop:
         demonstrations = jax.tree.map(lambda leaf: np.stack([leaf] * num_seeds), jax.device_get(demonstrations))
         demonstrations, seeds = spread((demonstrations, np.arange(num_seeds, dtype=np.uint32)), self._mesh)
         key = jax.jit(over_seeds(jax.random.key, self._mesh))(seeds)
-        self.data: Guidance = jax.jit(self._program(training.guidance))(demonstrations)
-        self.state: TrainState = jax.jit(self._program(training.init)).lower(key, self.data).compile(_RUN_ONCE)(key, self.data)
+        self._with_sampler = functools.partial(self._program, sampler=sampler_for(self.env, config))
+        self.data: Guidance = jax.jit(self._program(guidance))(demonstrations)
+        self.state: TrainState = jax.jit(self._with_sampler(training.init)).lower(key, self.data).compile(_RUN_ONCE)(key, self.data)
         num_iterations = self.capacity // config.num_envs if full else training.warm_up_iterations(self.env, config)
-        collect = jax.jit(self._program(training.collect, num_iterations=num_iterations), donate_argnums=0)
+        collect = jax.jit(self._with_sampler(training.collect, num_iterations=num_iterations), donate_argnums=0)
         self.state = jax.block_until_ready(collect(self.state, self.data))
 
     @property
@@ -60,7 +62,7 @@ class Loop:
         num_iterations, rest = divmod(num_updates, self.config.updates_per_iteration)
         if rest:
             raise ValueError(f"{num_updates} gradient steps are no multiple of the {self.config.updates_per_iteration} of an iteration")
-        learn = jax.jit(self._program(training.learn, num_iterations=num_iterations), donate_argnums=0).lower(self.state, self.data).compile()
+        learn = jax.jit(self._with_sampler(training.learn, num_iterations=num_iterations), donate_argnums=0).lower(self.state, self.data).compile()
 
         def call() -> None:
             self.state, metrics = learn(self.state, self.data)
@@ -83,28 +85,14 @@ def first_seed(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[0], tree)
 
 
-def draw_batch(key: Array, state: TrainState, data: Guidance, *, env: Environment, config: BatchConfig) -> Transition:
-    """The batch of one gradient step, drawn as `train.learn` draws it."""
-    return replay.sample_batch(
-        key,
-        state.replay,
-        data.demonstrations,
-        data.goals,
-        achieved_goal=env.achieved_goal,
-        epsilon=data.epsilon,
-        demo_rows=replay.num_demo_rows(state.env_steps, config),
-        config=config,
-    )
-
-
-def sampler(loop: Loop, config: BatchConfig, num_batches: int) -> Callable[[], Transition]:
+def sampler(loop: Loop, config: TrainConfig, num_batches: int) -> Callable[[], Transition]:
     """Compiles the uniform drawing of `num_batches` batches, one after the other, from the replay that the loop (of one seed) has at each call."""
 
     @jax.jit
     def draw(key: Array, state: TrainState, data: Guidance) -> Transition:
         state, data = first_seed((state, data))
         keys = jax.random.split(key, num_batches)
-        return jax.lax.map(lambda key: draw_batch(key, state, data, env=loop.env, config=config), keys)
+        return jax.lax.map(lambda key: sample_batch(key, state.replay, data, state.env_steps, loop.env, config), keys)
 
     key = jax.random.key(0)
     return lambda: jax.block_until_ready(draw(key, loop.state, loop.data))
@@ -115,22 +103,23 @@ def prioritised_sampler(loop: Loop, num_batches: int) -> Callable[[], None]:
 
     Each call goes on from the priorities that the last one left. Errors are made up; what it takes to compute them is not in here.
     """
-    config, together = loop.config.batch, loop.config.updates_per_iteration
+    config, together = loop.config, loop.config.updates_per_iteration
 
     @functools.partial(jax.jit, donate_argnums=0)
     def draw(first: Priorities, key: Array, state: TrainState, data: Guidance) -> tuple[Priorities, Transition]:
         state, data = first_seed((state, data))
-        given = dict(demonstrations=data.demonstrations, table=data.goals, achieved_goal=loop.env.achieved_goal, epsilon=data.epsilon, config=config)
 
         def iteration(before: Priorities, key: Array) -> tuple[Priorities, Transition]:
-            sample = functools.partial(replay.sample_prioritised_batch, replay=state.replay.replace(priorities=before), **given)
+            def sample(key: Array) -> tuple[Transition, prioritised.Drawn]:
+                return prioritised.sample_batch(key, state.replace(sampler=before), data, loop.env, config)
+
             batches, drawn = jax.vmap(sample)(jax.random.split(key, together))
-            return priorities.assign(before, drawn, batches.weight, config), batches
+            return prioritised.assign(before, drawn, batches.weight, config.priority), batches
 
         return jax.lax.scan(iteration, first, jax.random.split(key, num_batches // together))
 
     key = jax.random.key(0)
-    latest = jax.tree.map(jnp.copy, first_seed(loop.state.replay.priorities))
+    latest = jax.tree.map(jnp.copy, first_seed(loop.state.sampler))
 
     def call() -> None:
         nonlocal latest

@@ -19,8 +19,7 @@ from flax import struct
 from benchmarks import timing
 from hindrl_jax.base.types import Array
 from hindrl_jax.config import AgentConfig
-from hindrl_jax.core import agent as agents
-from hindrl_jax.core import networks
+from hindrl_jax.core import kernels, networks
 from hindrl_jax.core.networks import Params
 
 _STEP_SIZE = 1e-9  # so small that the parameters stay what they are however long the benchmark runs
@@ -71,10 +70,10 @@ def plain(action_dim: int) -> Form:
 
 def own(config: AgentConfig, action_dim: int, batch_size: int) -> Form:
     """The networks of hindrl_jax, over the blocks that `agent.update` cuts."""
-    num_blocks = agents._num_blocks(batch_size, config)
+    num_blocks = kernels.num_blocks(batch_size, max(config.net_arch))
 
     def mean_gradient(gradient: Callable[[Batch], Params], batch: Batch) -> Params:
-        return agents._mean_over_blocks(gradient, batch, num_blocks)
+        return kernels.mean_over_blocks(gradient, batch, num_blocks)
 
     return Form(
         action=lambda actor, inputs: networks.apply_actor(actor, inputs, config, action_dim=action_dim).mode,

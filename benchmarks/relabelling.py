@@ -10,7 +10,7 @@ import hindrl_jax
 from benchmarks import report, timing
 from benchmarks.loop import Loop, sampler, whole_episodes
 from benchmarks.timing import Contestant, Options, Row
-from hindrl_jax.config import BatchConfig
+from hindrl_jax.config import TrainConfig
 from hindrl_jax.core import goals
 
 TITLE = "Relabelling"
@@ -37,12 +37,12 @@ def run(options: Options) -> list[Row]:
     learning = [{"what": "learn", "strategy": strategy} | result for strategy, result in timing.take_turns(contestants, options.effort).items()]
 
     loop = Loop(dataclasses.replace(config, buffer_size=12_800) if options.quick else config, full=True)
-    print(f"{TITLE}: replay.sample_batch, batch {BATCH_SIZE}, from a full replay of {loop.capacity:,} transitions", flush=True)
+    print(f"{TITLE}: batch.sample_batch, batch {BATCH_SIZE}, from a full replay of {loop.capacity:,} transitions", flush=True)
     batches = {"off": dataclasses.replace(config.batch, batch_size=BATCH_SIZE, relabelled_per_original=0.0)} | {
         strategy: dataclasses.replace(config.batch, batch_size=BATCH_SIZE, hindrl_sampling_strategy=strategy)
-        for strategy in (STRATEGIES[-2:-1] if options.quick else STRATEGIES[:-1])  # an intersection needs what the loop notes while it lives
+        for strategy in (STRATEGIES[-2:-1] if options.quick else STRATEGIES[:-1])  # an intersection needs what a replay made for it notes
     }
-    contestants = {strategy: _draws(loop, batch) for strategy, batch in batches.items()}
+    contestants = {strategy: _draws(loop, dataclasses.replace(config, batch=batch)) for strategy, batch in batches.items()}
     rows = learning + [
         {"what": "sample_batch", "strategy": strategy} | result for strategy, result in timing.take_turns(contestants, options.effort).items()
     ]
@@ -60,8 +60,8 @@ def run(options: Options) -> list[Row]:
     return rows
 
 
-def _draws(loop: Loop, batch: BatchConfig) -> Contestant:
-    return timing.calls(sampler(loop, batch, BATCHES_PER_CALL), units=BATCHES_PER_CALL)
+def _draws(loop: Loop, config: TrainConfig) -> Contestant:
+    return timing.calls(sampler(loop, config, BATCHES_PER_CALL), units=BATCHES_PER_CALL)
 
 
 def _filter(achieved_goals: jax.Array, epsilon: jax.Array) -> Contestant:
@@ -81,7 +81,7 @@ def tables(rows: list[Row]) -> str:
         f"One gradient step of the whole loop by strategy, default recipe with {max(NUM_DEMONSTRATIONS)} demonstrations and a full replay of a "
         f"million transitions; drawing one batch of {BATCH_SIZE} alone, demonstration rows included; and the epsilon filter over all demonstrations "
         "(101 states each, once per run, the call from Python included). The relabelled share of a batch does not change its cost: goals are drawn "
-        "for all rows. An intersection is prepared while episodes are lived, so its cost is in the gradient step alone.\n\n"
+        "for all rows. An intersection is prepared while episodes are recorded, so its cost is in the gradient step alone.\n\n"
     )
     reference = next(row for row in rows if row["what"] == "learn" and row["strategy"] == REFERENCE)
     lines = []

@@ -13,6 +13,7 @@ from benchmarks import report, timing
 from benchmarks.loop import Loop, prioritised_sampler, sampler, whole_episodes
 from benchmarks.timing import Options, Row
 from hindrl_jax.base.environments import Environment
+from hindrl_jax.config import PriorityConfig
 
 TITLE = "Replay size"
 SIZES = (10_000, 1_000_000)
@@ -32,10 +33,10 @@ def run(options: Options) -> list[Row]:
         loop = Loop(dataclasses.replace(config, buffer_size=whole_episodes(size, config.num_envs)), full=True)
         loops[loop.capacity] = loop
     largest = loops[max(loops)]
-    batch = dataclasses.replace(config.batch, priority_exponent=0.6, demo_priority_bonus=1.0)
-    prioritised = Loop(dataclasses.replace(largest.config, batch=batch), full=True)
+    priority = PriorityConfig(priority_exponent=0.6, demo_priority_bonus=1.0)
+    prioritised = Loop(dataclasses.replace(largest.config, priority=priority), full=True)
     effort = dataclasses.replace(options.effort, rounds=ROUNDS * options.effort.rounds)
-    sampling = {capacity: timing.calls(sampler(loop, config.batch, BATCHES_PER_CALL), units=BATCHES_PER_CALL) for capacity, loop in loops.items()}
+    sampling = {capacity: timing.calls(sampler(loop, config, BATCHES_PER_CALL), units=BATCHES_PER_CALL) for capacity, loop in loops.items()}
     learning = {capacity: timing.calls(loop.learner(UPDATES_PER_CALL), units=UPDATES_PER_CALL) for capacity, loop in loops.items()}
     learning["prioritised"] = timing.calls(prioritised.learner(UPDATES_PER_CALL), units=UPDATES_PER_CALL)
     sampling["prioritised"] = timing.calls(prioritised_sampler(prioritised, BATCHES_PER_CALL), units=BATCHES_PER_CALL)
@@ -84,7 +85,7 @@ def tables(rows: list[Row]) -> str:
     names = {"learn": "one gradient step, whole loop", "sample_batch": "drawing one batch alone"}
     all_names = names | {
         "learn_prioritised": "one gradient step, whole loop, with priorities",
-        "sample_batch_prioritised": "drawing one batch alone by priorities, which it is then given anew",
+        "sample_batch_prioritised": "drawing one batch alone by priorities, which are then assigned again",
     }
     lines = [
         [

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
+import jax.numpy as jnp
 
 import hindrl_jax
 from hindrl_jax.config import TrainConfig
-from hindrl_jax.core import agent as agents
+from hindrl_jax.core.inputs import InputScale, network_inputs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,9 +24,9 @@ class Setting:
     def dims(self) -> dict[str, int]:
         """Sizes of the networks' inputs: `input_dim`, all but the action, and `action_dim`."""
         env = hindrl_jax.make("FixedGridPickAndPlace")
-        sizes = dict(observation_dim=env.observation_dim, goal_dim=env.goal_dim, action_dim=env.action_dim)
-        agent = jax.eval_shape(lambda key: agents.init(key, self.config.agent, **sizes), jax.random.key(0))
-        return {"input_dim": agent.actor["params"]["Dense_0"]["kernel"].shape[0], "action_dim": env.action_dim}
+        observation, goal = jnp.ones(env.observation_dim), jnp.ones(env.goal_dim)
+        scale = InputScale(observation=observation, goal=goal, observation_centre=observation, goal_centre=goal)
+        return {"input_dim": network_inputs(observation, goal, goal, scale, self.config).shape[-1], "action_dim": env.action_dim}
 
 
 def _reach() -> TrainConfig:

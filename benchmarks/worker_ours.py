@@ -18,12 +18,15 @@ from typing import Any
 import jax
 
 from benchmarks import passes, timing
-from benchmarks.loop import Loop, draw_batch, first_seed
+from benchmarks.loop import Loop, first_seed
 from benchmarks.settings import SETTINGS, Setting
 from hindrl_jax.base.types import Array, Transition
 from hindrl_jax.core import agent as agents
 from hindrl_jax.core.agent import AgentState
-from hindrl_jax.core.train import Guidance, TrainState
+from hindrl_jax.core.batch import sample_batch
+from hindrl_jax.core.guidance import Guidance
+from hindrl_jax.core.schedules import schedule
+from hindrl_jax.core.train import TrainState
 
 
 def whole_loop(setting: Setting) -> Callable[[], None]:
@@ -39,32 +42,26 @@ def whole_loop_bfloat16(setting: Setting) -> Callable[[], None]:
 
 def update_alone(setting: Setting) -> Callable[[], None]:
     """`agent.update` on one batch that stays the same."""
-    config, loop = setting.config.agent, Loop(setting.config)
-    env = loop.env
-    schedule = agents.schedule(0.0, 0, config, action_dim=env.action_dim)
+    config, loop = setting.config, Loop(setting.config)
+    now = schedule(0.0, 0, config.agent, action_dim=loop.env.action_dim)
 
     @jax.jit
-    def prepare(state: TrainState, data: Guidance) -> tuple[Transition, Array, Array]:
+    def prepare(state: TrainState, data: Guidance) -> Transition:
         state, data = first_seed((state, data))
-        batch = draw_batch(jax.random.key(0), state, data, env=env, config=setting.config.batch)
+        return sample_batch(jax.random.key(0), state.replay, data, state.env_steps, loop.env, config)
 
-        def inputs(observation: Array) -> Array:
-            return agents.network_inputs(observation, env.achieved_goal(observation), batch.desired_goal, data.scale, config)
-
-        return batch, inputs(batch.observation), inputs(batch.next_observation)
-
-    def updates(agent: AgentState, key: Array, batch: Transition, inputs: Array, next_inputs: Array) -> AgentState:
+    def updates(agent: AgentState, key: Array, batch: Transition) -> tuple[AgentState, Any]:
         def one(agent: AgentState, key: Array) -> tuple[AgentState, Any]:
-            return agents.update(key, agent, batch, inputs=inputs, next_inputs=next_inputs, schedule=schedule, config=config)
+            return agents.update(key, agent, batch, now, config)
 
         return jax.lax.scan(one, agent, jax.random.split(key, setting.steps_per_call))
 
-    agent, key, fixed = first_seed(loop.state.agent), jax.random.key(1), prepare(loop.state, loop.data)
-    compiled = jax.jit(updates, donate_argnums=0).lower(agent, key, *fixed).compile()
+    agent, key, batch = first_seed(loop.state.agent), jax.random.key(1), prepare(loop.state, loop.data)
+    compiled = jax.jit(updates, donate_argnums=0).lower(agent, key, batch).compile()
 
     def call() -> None:
         nonlocal agent
-        agent, metrics = compiled(agent, key, *fixed)
+        agent, metrics = compiled(agent, key, batch)
         jax.block_until_ready((agent, metrics))
 
     return call

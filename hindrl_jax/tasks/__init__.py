@@ -1,5 +1,8 @@
-"""The tasks by name: each environment with its expert, its viewer and its configs, ours and Gymnasium's.
+"""The tasks by name: each environment with its expert, its viewer and its configs; Gymnasium's as ours, and ours as Gymnasium's.
 
-Public are `registry` (`make`, `register`, `task`), `presets` (`preset`), `from_gymnasium` (Gymnasium's environments as ours), `as_gymnasium` (ours as
-Gymnasium's) and `ids` (the entries in Gymnasium's registry, all that `import hindrl_jax` runs).
+    registry           make, register, task: environments by name
+    presets            preset: configs by name
+    from_gymnasium     environments of Gymnasium, as tasks to learn; simulators are many of them side by side
+    as_gymnasium       our environments as Gymnasium's
+    ids                the entries in Gymnasium's registry, all that `import hindrl_jax` runs
 """

@@ -1,4 +1,14 @@
 """Training, recording and playing in memory: many seeds in one program, spread over devices; no disk and no printing.
 
-Public are `experiment` (`fit`, `Result`, `record_demonstrations`), `recording`, `host` (environments that are stepped outside JAX) and `devices`.
+Environments are asked what they can do (`hindrl_jax.base`), never of what kind they are.
+
+    experiment      fit: the loop between the programs, with evaluations
+    result          what it leaves: Result, Row, SeedSummary
+    checks          what is refused, in a line that names the ability that is missing
+    programs        the compiled programs of an experiment; of environments that are stepped in JAX
+    host            the same for environments that are stepped outside JAX
+    playing         episodes by an expert or by trained policies, wherever they are stepped; host_playing outside JAX
+    recording       record_demonstrations, record_gymnasium
+    prioritised     prioritised replay, as a sampler for the core
+    devices         the seed axis spread over devices
 """

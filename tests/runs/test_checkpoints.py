@@ -21,6 +21,7 @@ from tiny import ENV
 
 import hindrl_jax as hindrl
 from hindrl_jax import cli
+from hindrl_jax.config import PriorityConfig
 from hindrl_jax.reporting.progress import ProgressBar
 from hindrl_jax.runs.checkpoints import Checkpoints
 from hindrl_jax.runs.spec import RunSpec
@@ -28,7 +29,7 @@ from hindrl_jax.runs.writer import RunWriter
 from hindrl_jax.training import devices, experiment
 
 CONFIG = dataclasses.replace(tiny.CONFIG, steps=84)
-PRIORITISED = dataclasses.replace(CONFIG, batch=dataclasses.replace(CONFIG.batch, priority_exponent=0.6))
+PRIORITISED = dataclasses.replace(CONFIG, priority=PriorityConfig(priority_exponent=0.6))
 CLONING = dataclasses.replace(CONFIG, algo="bc", steps=60)
 SEEDS = (3, 4)
 
