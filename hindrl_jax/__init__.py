@@ -57,10 +57,10 @@ if TYPE_CHECKING:
     from hindrl_jax.tasks.presets import preset as preset
     from hindrl_jax.tasks.registry import make as make
     from hindrl_jax.tasks.registry import register as register
-    from hindrl_jax.training.result import Result as Result
     from hindrl_jax.training.experiment import fit as fit
     from hindrl_jax.training.recording import record_demonstrations as record_demonstrations
     from hindrl_jax.training.recording import record_gymnasium as record_gymnasium
+    from hindrl_jax.training.result import Result as Result
 else:  # a type checker that saw this would believe in every name
 
     def __getattr__(name: str) -> Any:

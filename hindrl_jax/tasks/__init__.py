@@ -5,4 +5,6 @@
     from_gymnasium     environments of Gymnasium, as tasks to learn; simulators are many of them side by side
     as_gymnasium       our environments as Gymnasium's
     ids                the entries in Gymnasium's registry, all that `import hindrl_jax` runs
+
+A task of somebody else's joins them by `registry.register`.
 """

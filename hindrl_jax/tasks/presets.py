@@ -76,7 +76,7 @@ that climbs the value relative to its size. Each says for itself how far its tar
 
 
 def _default(algo: Algorithm, family: Family) -> TrainConfig:
-    """The project's own recipe. For the grid it is `TrainConfig()`, run for longer and with a second life."""
+    """The project's own recipe. For the grid it is `TrainConfig()`, run for longer and with a reset of the agent."""
     encoding: Literal["standardised", "multiscale"] = "standardised" if family == "reach" else "multiscale"
     if algo == "bc":
         return TrainConfig(

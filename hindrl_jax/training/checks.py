@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from hindrl_jax.base.environments import Environment, Restorable, RelabelsObservations, backends_with, can_step
+from hindrl_jax.base.environments import Environment, RelabelsObservations, Restorable, backends_with, can_step
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.steppers import can_step_on_host
 from hindrl_jax.base.types import Episodes

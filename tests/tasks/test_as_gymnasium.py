@@ -98,7 +98,7 @@ def random_actions(env, steps):
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_side_by_side_they_live_the_episodes_of_single_ones(mode):
-    """With few steps to an episode, each lives through several."""
+    """With few steps to an episode, each begins several."""
     together = gymnasium.make_vec(GRID, 3, max_episode_steps=4, autoreset_mode=mode)
     apart = gymnasium.make_vec(GRID, 3, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, max_episode_steps=4)
     assert together.metadata["autoreset_mode"] is AutoresetMode(mode)

@@ -21,8 +21,8 @@ APPENDIX = {
     "max_demo_ratio": 0.1,
     "reach_zero": 500_000,
     "hindrl_sampling_strategy": "task_conditioned",
-    "m": 0,
-    "k": 0.0,
+    "epsilon_steps": 0,
+    "epsilon_deviations": 0.0,
 }
 # Appendix A.1.2: where the robot task differs. The text of the appendix has lost one of its eight layers.
 APPENDIX_REACH = APPENDIX | {
@@ -33,7 +33,7 @@ APPENDIX_REACH = APPENDIX | {
     "learning_starts": 5_000,
     "bc_weight": 0.0,
     "reach_zero": 1_000_000,
-    "m": 5,
+    "epsilon_steps": 5,
 }
 # What its text leaves to its framework (Stable-Baselines3 with sb3-contrib's TQC).
 FRAMEWORK = {
@@ -48,13 +48,13 @@ FRAMEWORK = {
     "num_envs": 1,
     "updates_per_iteration": 1,
     "n_step": 1,
-    "terminate_on_relabel": False,
+    "bootstrap_past_relabelled_goals": True,
     "layer_norm": False,
     "input_encoding": "raw",
     "actor_average_rate": 1.0,
     "actor_average_span": 0.0,
-    "policy_input": "achieved_desired_observation",
-    "inclusive_goal_test": True,
+    "achieved_goal_input": True,
+    "strict_goal_test": False,
     "bc_loss": "squared",
     "bc_action": "mean",
     "behavioural_goals": "final_demonstration_states",
@@ -90,23 +90,23 @@ def test_thesis_bc_is_the_appendix(env):
     assert (values["batch_size"], values["learning_rate"], values["net_arch"]) == (2_048, 1e-3, (32, 32))
 
 
-@pytest.mark.parametrize(("env", "more"), [("FixedGridPickAndPlace", {}), ("FixedParameterizedReach", {"misalign_demo_actions": True})])
+@pytest.mark.parametrize(("env", "more"), [("FixedGridPickAndPlace", {}), ("FixedParameterizedReach", {"misaligned_demo_actions": True})])
 def test_original_preset_differs_from_the_thesis_by_the_quirks_alone(env, more):
     thesis, original = flat(preset("hindrl", "thesis", env=env)), flat(preset("hindrl", "original", env=env))
     assert {name: original[name] for name in original if original[name] != thesis[name]} == {
-        "inclusive_goal_test": False,
+        "strict_goal_test": True,
         "timeouts_are_terminal": True,
         "behavioural_goals": "task",
         "exclude_last_goal": True,
-        "rescale_demo_actions": False,
+        "unscaled_demo_actions": True,
         "bc_loss": "norm",
         "bc_action": "sample",
     } | more
 
 
 def test_default_recipes_differ_by_family_and_the_grid_has_the_defaults_of_the_config():
-    second_life = dataclasses.replace(TrainConfig(), steps=240_000, agent_resets=(1 / 3,))
-    assert preset("hindrl", env="GridPickAndPlace") == preset("hindrl") == second_life
+    with_reset = dataclasses.replace(TrainConfig(), steps=240_000, agent_resets=(1 / 3,))
+    assert preset("hindrl", env="GridPickAndPlace") == preset("hindrl") == with_reset
     fixed, relabelling = preset("hindrl", env="FixedParameterizedReach"), preset("hindrl", env="ParameterizedReach")
     assert preset("hindrl", env=make("ParameterizedReach", num_waypoints=1)) == relabelling
     assert len({TrainConfig(), fixed, relabelling}) == 3  # observations are relabelled there, in part with demonstrated states
