@@ -14,7 +14,6 @@ import json
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -50,25 +49,37 @@ def small_config(algo, kind, env):
     return dataclasses.replace(config, num_envs=4, updates_per_iteration=1, learning_starts=0, buffer_size=4000, batch=batch, agent=agent)
 
 
+PROGRAMS = {}
+
+
+def compiled(function, *arguments):
+    """The function's result. Compiling takes nearly all of the time here, so cases whose programs come out the same share them."""
+    lowered = jax.jit(function).lower(*arguments)
+    text = lowered.as_text()
+    if text not in PROGRAMS:
+        PROGRAMS[text] = lowered.compile()
+    return PROGRAMS[text](*arguments)
+
+
 def run(case):
     """Each metric of the first updates, and after them the sums of the sizes of all parameters, by names that begin with the case's."""
     env_name, algo, kind = CASES[case]
     env, demonstrations = environment_and_demonstrations(env_name)
     config = small_config(algo, kind, env)
+    given = dict(env=env, config=config)
 
-    @jax.jit
-    def first_updates(key, demonstrations):
-        data = guidance(demonstrations, env, config)
-        state, step = train.init(key, data, env, config), train.clone
-        if config.learns_from_rollouts:
-            state = train.collect(state, data, env=env, config=config, num_iterations=train.warm_up_iterations(env, config))
-            step = train.learn
-        state, metrics = jax.lax.scan(lambda state, _: step(state, data, env=env, config=config, num_iterations=1), state, length=NUM_UPDATES)
-        for name in ("actor", "critics"):
-            metrics[f"{name}/size"] = sum(jnp.sum(jnp.abs(leaf)) for leaf in jax.tree.leaves(getattr(state.agent, name)))
-        return metrics
+    def updates(state, data):
+        step = train.learn if config.learns_from_rollouts else train.clone
+        return jax.lax.scan(lambda state, _: step(state, data, **given, num_iterations=1), state, length=NUM_UPDATES)
 
-    metrics = jax.device_get(first_updates(jax.random.key(7), demonstrations))
+    data = compiled(lambda demonstrations: guidance(demonstrations, **given), demonstrations)
+    state = compiled(lambda key, data: train.init(key, data, **given), jax.random.key(7), data)
+    if config.learns_from_rollouts:
+        num_iterations = train.warm_up_iterations(env, config)
+        state = compiled(lambda state, data: train.collect(state, data, **given, num_iterations=num_iterations), state, data)
+    state, metrics = compiled(updates, state, data)
+    for name in ("actor", "critics"):
+        metrics[f"{name}/size"] = sum(np.abs(leaf).sum() for leaf in jax.tree.leaves(getattr(state.agent, name)))
     return {f"{case} {name}": np.atleast_1d(values).tolist() for name, values in metrics.items()}
 
 
