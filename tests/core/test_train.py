@@ -1,4 +1,4 @@
-"""Training end to end at toy size: what is counted, what is stored, what is compiled."""
+"""Training end to end at toy size: what is counted, what is learnt, what is compiled."""
 
 import dataclasses
 import functools
@@ -10,18 +10,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toy_env import Corridor, corridor_demonstrations
+from corridor_training import COLLECT_STEPS, HORIZON, LEARN_STEPS, NUM_ENVS, make_config, make_data, make_env, with_output_bias
 
 from hindrl_jax.base.types import Episodes
-from hindrl_jax.config import AgentConfig, BatchConfig, GoalConfig, TrainConfig
+from hindrl_jax.config import AgentConfig, BatchConfig, TrainConfig
 from hindrl_jax.core import agent as agents
 from hindrl_jax.core import rollout, train
 from hindrl_jax.core.guidance import guidance
 from hindrl_jax.envs.grid import FixedGridPickAndPlace
 
-NUM_ENVS, HORIZON, COLLECT_STEPS, LEARN_STEPS = 3, 7, 14, 3
 # Every program is traced once in this file, whoever calls it: each test builds its own, equal config and environment.
-STATIC = ("env", "config", "num_iterations", "num_episodes", "stochastic")
+STATIC = ("env", "config", "num_iterations", "num_episodes")
 
 
 def program(function, **options):
@@ -33,41 +32,14 @@ init, collect, clone, evaluate = program(train.init), program(train.collect), pr
 learn = program(train.learn, donate_argnums=0)
 
 
-def make_env():
-    return Corridor(horizon=HORIZON, width=4.0)
-
-
-def make_config(**changes):
-    """Relabels from both sources. The last of the 4 demonstration rows goes at step 50, within the first call of `learn`: 4 (1 - 50 / 66) < 1."""
-    config = TrainConfig(
-        num_envs=NUM_ENVS,
-        updates_per_iteration=2,
-        learning_starts=NUM_ENVS * HORIZON,
-        buffer_size=30_000,
-        steps=102,
-        batch=BatchConfig(batch_size=16, hindrl_sampling_strategy="joint_union", reach_zero=66),
-        goal=GoalConfig(epsilon_steps=1, epsilon_deviations=1.0, epsilon_filtering=True),
-        agent=AgentConfig(net_arch=(8,), num_quantiles=5, top_quantiles_to_drop_per_net=1, target_entropy=-1000.0, final_target_entropy=1000.0),
-    )
-    return dataclasses.replace(config, **changes)
-
-
 @pytest.fixture(scope="module")
 def data():
-    return guidance(corridor_demonstrations((1.0, 1.25, 0.9), env=make_env()), make_env(), make_config())
+    return make_data(make_config())
 
 
 def collected(seed, data):
     state = init(jax.random.key(seed), data, make_env(), make_config())
     return collect(state, data, env=make_env(), config=make_config(), num_iterations=COLLECT_STEPS)
-
-
-def with_output_bias(state, bias):
-    """The state with an actor that has the same (mean, log_std) everywhere, whatever it sees."""
-    last = state.agent.actor["params"]["Dense_1"]
-    last = {"kernel": jnp.zeros_like(last["kernel"]), "bias": jnp.array(bias)}
-    actor = {"params": {**state.agent.actor["params"], "Dense_1": last}}
-    return state.replace(agent=state.agent.replace(actor=actor))
 
 
 def actor_of(state):
@@ -118,57 +90,6 @@ def test_target_entropy_moves_with_the_environment_steps(learnt):
     _, metrics_first, second, metrics_second = learnt
     assert second.agent.log_alpha < 0.0
     assert metrics_first["alpha/loss"] < 0.0 < metrics_second["alpha/loss"]
-
-
-def recorded_episodes(state):
-    """(environment, length, observations, actions, rewards, terminated, goal) of the complete episodes, oldest first in each environment."""
-    episodes = jax.device_get(state.replay.episodes)
-    slots = len(episodes.lengths) // NUM_ENVS
-    for row in np.flatnonzero(episodes.lengths):
-        length = episodes.lengths[row]
-        yield (
-            row // slots,
-            length,
-            episodes.observations[row, : length + 1],
-            episodes.actions[row, :length],
-            episodes.rewards[row, :length],
-            episodes.terminated[row],
-            episodes.desired_goals[row],
-        )
-
-
-def test_replay_holds_what_was_recorded(learnt, data):
-    goals = np.asarray(data.behavioural_goals.goals)
-    starts = []
-    for _, length, observations, actions, rewards, terminated, goal in recorded_episodes(learnt[2]):
-        starts.append(observations[0, 0])
-        assert np.all(observations[:, 0] == observations[0, 0])  # one episode, not two
-        assert observations[:, 1].tolist() == list(range(length + 1))
-        np.testing.assert_allclose(np.diff(observations[:, 2]), actions[:, 0] + 1.0, atol=1e-5)  # policy units to velocities
-        assert rewards.tolist() == (observations[1:, 2] > 4.0).tolist()
-        assert bool(terminated) == bool(rewards[-1])
-        assert rewards[:-1].sum() == 0.0
-        assert terminated or length == HORIZON
-        assert np.any(goal == goals)
-        assert np.abs(actions).max() <= 1.0
-    assert len(starts) >= NUM_ENVS * 2
-    assert len(set(starts)) == len(starts)
-
-
-def test_actions_are_uniform_at_first_and_the_policys_when_learning(learnt):
-    replay = learnt[0].replay
-    slots, first_of_policy = len(replay.episodes.lengths) // NUM_ENVS, set()
-    for env in range(NUM_ENVS):
-        rows = [(env * slots + slot, length) for slot, length in enumerate(replay.episodes.lengths[env * slots : (env + 1) * slots]) if length]
-        rows.append((env * slots + replay.slot[env], replay.step[env]))  # the episode under way
-        actions = np.concatenate([replay.episodes.actions[row, :length] for row, length in rows])
-        assert len(actions) == COLLECT_STEPS + LEARN_STEPS
-        # The policy has moved by a few Adam steps of 1e-3; a uniform action is as near as that to it with probability 1e-3 at most.
-        from_policy = np.all(np.abs(actions - np.array([0.5, -0.5])) < 0.05, axis=1)
-        assert from_policy.tolist() == [False] * COLLECT_STEPS + [True] * LEARN_STEPS
-        assert actions[:COLLECT_STEPS].std() > 0.4  # U(-1, 1) has 0.58
-        first_of_policy.add(float(actions[COLLECT_STEPS, 0]))
-    assert len(first_of_policy) == NUM_ENVS  # sampled: the mean action is the same in all environments
 
 
 def stack(*trees):
@@ -259,26 +180,8 @@ def test_reset_and_step_are_traced_once(data):
     assert time_step.reward.shape == (4,)
 
 
-def test_training_episodes_are_cut_at_random_and_evaluations_never_are(data):
-    env, config = make_env(), make_config(random_truncation=0.5)
-
-    @jax.jit
-    def run(key):
-        key_init, key_evaluate = jax.random.split(key)
-        state = train.init(key_init, data, env, config)
-        state = with_output_bias(train.collect(state, data, env=env, config=config, num_iterations=60), [0.0, 0.0, 0.0, 0.0])
-        return state.replay, train.evaluate(key_evaluate, actor_of(state), data, env=env, config=config, num_episodes=20)
-
-    replay, evaluation = jax.device_get(run(jax.random.key(0)))
-    complete = replay.episodes.lengths > 0
-    lengths = replay.episodes.lengths[complete & ~replay.episodes.terminated]
-    assert lengths.size > 20
-    assert 1.0 < lengths.mean() < 3.0  # 2 steps, if none were cut by the horizon
-    assert evaluation.length.tolist() == [5] * 20
-
-
 def test_warm_start_clones_the_actor_and_all_that_follows_it(data):
-    agent = dataclasses.replace(make_config().agent, base="td3", preactivation_weight=0.0, learning_rate=1e-2, target_update_rate=0.1)
+    agent = dataclasses.replace(make_config().agent, base="td3", learning_rate=1e-2, target_update_rate=0.1)
     config = make_config(agent=agent, bc_warm_start=300, batch=BatchConfig(batch_size=32))
     start = train.init(jax.random.key(0), data, make_env(), config)
     run = functools.partial(train.clone, env=make_env(), config=config, num_iterations=config.bc_warm_start)
@@ -300,10 +203,8 @@ def test_schedules_move_with_the_gradient_steps_of_cloning_but_not_of_a_warm_sta
     # The step size falls to 0 after the two steps of a run of bc; for the others, whose steps are those of environments, none is over.
     agent = dataclasses.replace(make_config().agent, final_learning_rate=0.0)
     config = make_config(algo=algo, agent=agent, steps=2, learning_starts=0)
-    states, step = (
-        [train.init(jax.random.key(0), data, make_env(), config)],
-        jax.jit(functools.partial(train.clone, env=make_env(), config=config, num_iterations=1)),
-    )
+    step = jax.jit(functools.partial(train.clone, env=make_env(), config=config, num_iterations=1))
+    states = [train.init(jax.random.key(0), data, make_env(), config)]
     for _ in range(4):
         states.append(step(states[-1], data)[0])
     kernels = [state.agent.actor["params"]["Dense_1"]["kernel"] for state in states]
