@@ -1,7 +1,5 @@
 """The agent on probe problems with known values: batches made by hand, a few hundred updates, small networks."""
 
-import dataclasses
-
 import chex
 import jax
 import jax.numpy as jnp
@@ -12,18 +10,21 @@ from probe import (
     CONFIG,
     NUM_UPDATES,
     SCHEDULE,
+    UNIT_SCALE,
     B,
     fresh_agent,
-    inputs_of,
     last,
     make_batch,
     mean_action,
+    one_update,
+    schedule_of,
     train,
     values,
+    with_agent,
     with_constant_critics,
+    with_quirks,
 )
 
-from hindrl_jax.config import AgentConfig
 from hindrl_jax.core import agent as agents
 
 
@@ -47,7 +48,7 @@ def test_largest_atoms_of_all_critics_together_are_dropped(num_dropped, expected
     start = fresh_agent(jax.random.key(2))
     start = with_constant_critics(start, [[0.0, 1.0, 2.0, 3.0], [10.0, 11.0, 12.0, 13.0]])
     batch = make_batch(action=ACTIONS, reward=0.0, discount=1.0)
-    _, metrics = train(2, batch, AgentConfig(**{**vars(CONFIG), "top_quantiles_to_drop_per_net": num_dropped}), start)
+    _, metrics = train(2, batch, with_agent(top_quantiles_to_drop_per_net=num_dropped), start)
     np.testing.assert_allclose(metrics["critic/target"][0], expected, atol=1e-3)  # alpha is 1e-4
 
 
@@ -62,7 +63,7 @@ def test_behaviour_cloning_follows_demonstrations_alone(bc_loss, bc_action):
         observation=(kind % 2)[:, None] * np.ones(2),
         is_demonstration=kind < 2,
     )
-    config = AgentConfig(**{**vars(CONFIG), "bc_weight": 100.0, "bc_loss": bc_loss, "bc_action": bc_action})
+    config = with_quirks(with_agent(bc_weight=100.0), bc_loss=bc_loss, bc_action=bc_action)
     start = fresh_agent(jax.random.key(4))
     states, metrics = train(4, batch, config, start)
     actions = mean_action(last(states), jnp.array([[0.0, 0.0], [1.0, 1.0]]))
@@ -79,7 +80,7 @@ def test_entropy_coefficient_moves_towards_minus_the_action_dimensions(rises):
     start = fresh_agent(jax.random.key(5)).replace(log_alpha=jnp.asarray(np.log(0.5), jnp.float32))
     start.actor["params"]["Dense_1"]["bias"] = jnp.array([0.0, -5.0 if rises else 0.0])
     batch = make_batch(action=ACTIONS, reward=0.0, discount=0.0)
-    states, metrics = train(5, batch, AgentConfig(**{**vars(CONFIG), "target_entropy": None}), start)
+    states, metrics = train(5, batch, with_agent(target_entropy=None), start)
     alphas = np.append(0.5, np.exp(states.log_alpha[:10]))
     np.testing.assert_allclose(metrics["alpha/value"][:11], alphas, rtol=1e-5)
     # Adam's steps are one learning rate long in log alpha while the gradient keeps its sign.
@@ -100,15 +101,6 @@ def test_entropy_bonus_enters_the_target():
     assert entropy[0.5] > 0.3
 
 
-@pytest.mark.parametrize(
-    ("start", "end", "entropies"),  # at the beginning, after a quarter, and at the end
-    [(None, None, [-3.0, -3.0, -3.0]), (-1.0, None, [-1.0, -1.0, -1.0]), (None, 5.0, [-3.0, -1.0, 5.0]), (4.0, 0.0, [4.0, 3.0, 0.0])],
-)
-def test_target_entropy_by_hand(start, end, entropies):
-    config = AgentConfig(target_entropy=start, final_target_entropy=end)
-    assert [agents.schedule(progress, 0, config, action_dim=3).target_entropy for progress in (0.0, 0.25, 1.0)] == entropies
-
-
 def test_target_critics_and_average_actor_move_by_their_rates():
     before = fresh_agent(jax.random.key(7))
     chex.assert_trees_all_equal(before.target_critics, before.critics)
@@ -122,71 +114,6 @@ def test_target_critics_and_average_actor_move_by_their_rates():
     moved = jax.tree.map(lambda old, new: 0.8 * old + 0.2 * new, before.average_actor, after.actor)
     chex.assert_trees_all_close(after.average_actor, moved, rtol=1e-5, atol=1e-7)
     assert max(np.abs(a - b).max() for a, b in zip(*map(jax.tree.leaves, (before.critics, after.critics)), strict=True)) > 1e-3
-
-
-# Observation (1, 2) less (0, 4) over (2, 4) is (1/2, -1/2); achieved goal 3 less 0 over 6 is 1/2, too, and desired goal 0 is 0.
-HALF = [0.5, np.tanh(2.0)]
-
-
-@pytest.mark.parametrize(
-    ("encoding", "form", "expected"),
-    [
-        ("raw", "observation_goal", [1.0, 2.0, 0.0]),
-        ("raw", "achieved_desired_observation", [3.0, 0.0, 1.0, 2.0]),
-        ("multiscale", "observation_goal", [0.5, -0.5, HALF[1], -HALF[1], 0.0, 0.0]),
-        ("multiscale", "achieved_desired_observation", [*HALF, 0.0, 0.0, 0.5, -0.5, HALF[1], -HALF[1]]),
-        ("standardised", "observation_goal", [0.5, -0.5, 0.0]),
-        ("standardised", "achieved_desired_observation", [0.5, 0.0, 0.5, -0.5]),
-    ],
-)
-def test_network_inputs_by_hand(encoding, form, expected):
-    scale = agents.InputScale(
-        observation=jnp.array([2.0, 4.0]), goal=jnp.array([6.0]), observation_centre=jnp.array([0.0, 4.0]), goal_centre=jnp.zeros(1)
-    )
-    config = AgentConfig(policy_input=form, input_encoding=encoding, net_arch=(3,))
-    parts = (jnp.array([[1.0, 2.0]]), jnp.array([[3.0]]), jnp.array([[0.0]]))
-    np.testing.assert_allclose(agents.network_inputs(*parts, scale, config), [expected], rtol=1e-6)
-    unbatched = agents.network_inputs(*(part[0] for part in parts), scale, config)
-    np.testing.assert_allclose(unbatched, expected, rtol=1e-6)
-    state = jax.eval_shape(lambda key: agents.init(key, config, observation_dim=2, goal_dim=1, action_dim=1), jax.random.key(0))
-    assert state.actor["params"]["Dense_0"]["kernel"].shape == (len(expected), 3)
-
-
-@pytest.mark.parametrize("padding", [7.0, np.nan])
-@pytest.mark.parametrize(
-    ("encoding", "centre", "size"),
-    [
-        # Three states count: (3, 0, 2), (4, 0, 2) and (5, 0, 2); root mean squares sqrt(50 / 3), 2 and, always zero, 1.
-        ("multiscale", [0.0, 0.0, 0.0], [(50 / 3) ** 0.5, 1.0, 2.0]),
-        # Means 4, 0 and 2, standard deviations sqrt(2 / 3) and, always equal, 1.
-        ("standardised", [4.0, 0.0, 2.0], [(2 / 3) ** 0.5, 1.0, 1.0]),
-    ],
-)
-def test_input_scale_by_hand(encoding, centre, size, padding):
-    observations = jnp.array([[[3.0, 0.0, 2.0], [4.0, 0.0, 2.0]], [[5.0, 0.0, 2.0], [padding, padding, padding]]])
-    config = AgentConfig(input_encoding=encoding)
-    scale = agents.input_scale(observations, observations[..., :1], jnp.array([[True, True], [True, False]]), config)
-    np.testing.assert_allclose(scale.observation, size, rtol=1e-6)
-    np.testing.assert_allclose(scale.observation_centre, centre, rtol=1e-6)
-    np.testing.assert_allclose([scale.goal, scale.goal_centre], [size[:1], centre[:1]], rtol=1e-6)
-
-
-def test_standardised_inputs_have_mean_0_and_deviation_1_over_what_was_visited():
-    rng = np.random.default_rng(0)
-    observations = rng.normal([0.4, -20.0, 1e-3], [1e-3, 5.0, 1e-5], (4, 30, 3)).astype(np.float32)
-    observations = np.concatenate([observations, np.full((4, 30, 1), 0.1, np.float32)], axis=2)  # and one dimension that never changes
-    visited = np.arange(30)[None] < np.array([[30], [7], [12], [1]])
-    padded = jnp.asarray(np.where(visited[..., None], observations, np.nan))
-    config = AgentConfig(input_encoding="standardised")
-    scale = agents.input_scale(padded, padded[..., :2], jnp.asarray(visited), config)
-    seen = jnp.asarray(observations[visited])
-    inputs = np.asarray(agents.network_inputs(seen, seen[:, :2], seen[:, :2], scale, config))
-    np.testing.assert_allclose(inputs.mean(axis=0), 0.0, atol=1e-3)
-    np.testing.assert_allclose(inputs[:, [0, 1, 2, 4, 5]].std(axis=0), 1.0, rtol=1e-3)
-    np.testing.assert_allclose(inputs[:, 3], 0.0, atol=1e-6)
-    # Elsewhere, that dimension counts by its difference.
-    elsewhere = agents.network_inputs(seen[0] + 0.5, seen[0, :2], seen[0, :2], scale, config)
-    np.testing.assert_allclose(elsewhere[3], 0.5, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -204,18 +131,12 @@ def test_bounds_of_the_targets_by_hand(clip, obtained, expected):
     start = with_constant_critics(start, 2 * [[-1.0, 0.0, 1.0, 2.0]])
     batch = make_batch(action=ACTIONS, reward=0.4, discount=0.5)
     batch = batch.replace(obtained_return=None if obtained is None else jnp.tile(jnp.array(obtained), B // 2))
-    config = dataclasses.replace(CONFIG, clip_targets=clip)
-    inputs = inputs_of(batch.observation, config)
-
-    @jax.jit
-    def target(key):
-        return agents.update(key, start, batch, inputs=inputs, next_inputs=inputs, schedule=SCHEDULE, config=config)[1]["critic/target"]
-
-    np.testing.assert_allclose(target(jax.random.key(0)), expected, atol=1e-5)
+    metrics = one_update(jax.random.key(0), start, batch, with_agent(clip_targets=clip))[1]
+    np.testing.assert_allclose(metrics["critic/target"], expected, atol=1e-5)
 
 
 def test_actions_by_hand():
-    shapes = jax.eval_shape(lambda key: agents.init(key, CONFIG, observation_dim=2, goal_dim=1, action_dim=2), jax.random.key(0)).actor
+    shapes = jax.eval_shape(lambda key: agents.init(key, UNIT_SCALE, CONFIG, action_dim=2), jax.random.key(0)).actor
     actor = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes)
     actor["params"]["Dense_1"]["bias"] = jnp.array([0.5, -1.0, np.log(0.1), np.log(2.0)])  # means, and logarithms of the deviations
     mode, sampled = (
@@ -232,14 +153,12 @@ def test_initial_alpha():
 
 def test_update_bc_overfits_a_tiny_batch_and_touches_only_the_actor():
     observation = np.random.default_rng(0).normal(size=(B, 2))
-    batch = make_batch(action=0.8 * np.sin(observation[:, :1]), reward=0.0, discount=0.0, observation=observation)
-    inputs = inputs_of(batch.observation, CONFIG)
+    batch = make_batch(action=0.8 * np.sin(observation[:, :1]), reward=0.0, discount=0.0, observation=observation, is_demonstration=True)
 
     @jax.jit
     def clone(start):
-        return jax.lax.scan(
-            lambda state, _: agents.update_bc(state, batch, inputs=inputs, schedule=SCHEDULE, config=CONFIG), start, length=NUM_UPDATES
-        )
+        keys = jax.random.split(jax.random.key(0), NUM_UPDATES)
+        return jax.lax.scan(lambda state, key: agents.update_bc(key, state, batch, SCHEDULE, CONFIG), start, keys)
 
     start = fresh_agent(jax.random.key(9))
     end, metrics = clone(start)
@@ -249,60 +168,71 @@ def test_update_bc_overfits_a_tiny_batch_and_touches_only_the_actor():
     assert final < 0.01 < 0.1 < first
     chex.assert_trees_all_close(end.average_actor, end.actor, atol=0.05)  # it has followed
     assert np.abs(end.average_actor["params"]["Dense_0"]["kernel"] - start.actor["params"]["Dense_0"]["kernel"]).max() > 0.1
-    for name in ("critics", "target_critics", "log_alpha", "critic_optimiser", "alpha_optimiser"):
+    for name in ("critics", "target_critics", "log_alpha", "critic_optimiser", "alpha_optimiser", "scale"):
         chex.assert_trees_all_equal(getattr(start, name), getattr(end, name))
 
 
-def test_learning_rate_moves_linearly_or_not_at_all():
-    moving = AgentConfig(learning_rate=1e-3, final_learning_rate=1e-4)
-    assert np.allclose([agents.schedule(progress, 0, moving, action_dim=1).learning_rate for progress in (0.0, 0.5, 1.0)], [1e-3, 5.5e-4, 1e-4])
-    constant = AgentConfig(learning_rate=1e-3, final_learning_rate=None)
-    assert [agents.schedule(progress, 0, constant, action_dim=1).learning_rate for progress in (0.0, 1.0)] == [1e-3, 1e-3]
+def with_constant_policy(state, modes, log_std):
+    """The state with an actor that has the same modes (A,) and logarithms of the deviations everywhere, whatever it sees."""
+    last_layer = state.actor["params"]["Dense_1"]
+    bias = jnp.concatenate([jnp.arctanh(jnp.asarray(modes)), jnp.full(len(modes), log_std)])
+    last_layer = {"kernel": jnp.zeros_like(last_layer["kernel"]), "bias": bias}
+    return state.replace(actor={"params": {**state.actor["params"], "Dense_1": last_layer}})
 
 
-def test_span_of_the_average_by_hand():
-    for rate, span, expected in ((0.2, 0.0, [0.2, 0.2, 0.2]), (1.0, 0.5, [1.0, 2 / 3, 0.1]), (0.3, 0.5, [0.3, 0.3, 0.1])):
-        config = AgentConfig(actor_average_rate=rate, actor_average_span=span)
-        rates = [agents.schedule(0.0, updates, config, action_dim=1).actor_average_rate for updates in (0, 1, 18)]
-        np.testing.assert_allclose(rates, expected, rtol=1e-6)
+# The policy plays (0.6, 0.8). Demonstrations play (0, 0), at a distance of 1, and (0.6, 0.2), at a distance of 0.6.
+PLAYED, DEMONSTRATED = np.array([0.6, 0.8]), np.tile([[0.0, 0.0], [0.6, 0.2]], (B // 2, 1))
 
 
-def test_blocks_are_as_few_as_the_cache_allows_and_equal(monkeypatch):
-    monkeypatch.setattr(agents, "_BLOCK_BYTES", 1000)
-    config = AgentConfig(net_arch=(5, 10))  # 40 bytes per row: at most 25 rows per block
-    assert [agents._num_blocks(batch_size, config) for batch_size in (1, 25, 26, 100, 120, 103)] == [1, 1, 2, 4, 5, 1]  # 103 is a prime
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert agents._num_blocks(100, config) == 1
+@pytest.mark.parametrize(
+    ("bc_loss", "expected", "slope"),
+    # The mean of 1 and 0.36, or of 1 and 0.6, over two action dimensions. The derivatives by the two modes are the means of twice the differences
+    # (0.6, 0.8) and (0, 0.6), or of the differences over their lengths, (0.6, 0.8) and (0, 1), again over two.
+    [("squared", 0.34, [0.3, 0.7]), ("norm", 0.4, [0.15, 0.45])],
+)
+@pytest.mark.parametrize("bc_action", ["mean", "sample"])
+def test_update_bc_by_hand(bc_loss, bc_action, expected, slope):
+    config = with_quirks(bc_loss=bc_loss, bc_action=bc_action)
+    start = jax.jit(lambda key: agents.init(key, UNIT_SCALE, config, action_dim=2))(jax.random.key(0))
+    start = with_constant_policy(start, PLAYED, -0.5)
+    batch = make_batch(action=0.0, reward=0.0, discount=0.0, is_demonstration=True).replace(action=jnp.asarray(DEMONSTRATED, jnp.float32))
+    after, metrics = jax.jit(lambda key: agents.update_bc(key, start, batch, SCHEDULE, config))(jax.random.key(1))
+    # Adam's first moment is a tenth of its first gradient; the derivative of tanh is 1 less its square.
+    given = 10.0 * after.actor_optimiser.mu["params"]["Dense_1"]["bias"]
+    if bc_action == "mean":
+        np.testing.assert_allclose(metrics["actor/bc_loss"], expected, rtol=1e-5)
+        np.testing.assert_allclose(given, [*(slope * (1.0 - PLAYED**2)), 0.0, 0.0], rtol=1e-4, atol=1e-7)
+        return
+    noise = np.asarray(jax.random.normal(jax.random.key(1), (2, B))).T  # one column per row of the batch
+    squared = np.sum((np.tanh(np.arctanh(PLAYED) + np.exp(-0.5) * noise) - DEMONSTRATED) ** 2, axis=1)
+    of_samples = np.mean(squared if bc_loss == "squared" else np.sqrt(squared)) / 2
+    np.testing.assert_allclose(metrics["actor/bc_loss"], of_samples, rtol=1e-5)
+    assert abs(of_samples - expected) > 0.01
+    assert np.abs(given[2:]).min() > 1e-4  # the deviations are trained, too
 
 
-def test_mean_over_blocks_is_the_mean_over_the_batch():
-    rng = np.random.default_rng(0)
-    columns = agents._Columns(
-        inputs=jnp.asarray(rng.normal(size=(3, 12)), jnp.float32),
-        next_inputs=jnp.zeros((3, 12)),
-        action=jnp.asarray(rng.normal(size=(2, 12)), jnp.float32),
-        reward=jnp.arange(12.0),
-        discount=jnp.ones(12),
-        is_demonstration=jnp.arange(12) < 5,
-        obtained_return=jnp.asarray(rng.uniform(size=12), jnp.float32),
-        noise=jnp.zeros((2, 12)),
-        next_noise=jnp.zeros((2, 12)),
-    )
+def test_policy_is_the_actor_or_its_average_with_the_scale():
+    state = fresh_agent(jax.random.key(0)).replace(average_actor="average", actor="actor")
+    assert agents.policy(state, average=False) == agents.Policy(actor="actor", scale=state.scale)
+    assert agents.policy(state, average=True) == agents.Policy(actor="average", scale=state.scale)
 
-    def function(block):
-        # Columns stay together: a product of different fields would show a mixture.
-        product = block.inputs[0] * block.action[1] * block.reward * block.is_demonstration * block.obtained_return
-        return {"mean": jnp.mean(product), "matrix": block.inputs @ block.action.T / block.reward.shape[0]}
 
-    expected = function(columns)
-    for num_blocks in (1, 2, 3, 12):
-        given = agents._mean_over_blocks(function, columns, num_blocks)
-        chex.assert_trees_all_close(given, expected, rtol=1e-5, atol=1e-6)
+def test_networks_see_both_ends_of_a_transition_at_its_goal():
+    # Everything is halved by the scale. Of the goals, the desired one is the same at both ends.
+    config = with_quirks(with_agent(input_encoding="standardised"), achieved_goal_input=True)
+    scale = UNIT_SCALE.replace(observation=jnp.full(2, 2.0), goal=jnp.full(1, 2.0))
+    start = jax.jit(lambda key: agents.init(key, scale, config, action_dim=1))(jax.random.key(0))
+    chex.assert_trees_all_equal(start.scale, scale)
+    batch = make_batch(action=ACTIONS, reward=0.0, discount=0.0, observation=[2.0, 4.0], next_observation=[6.0, 8.0])
+    batch = batch.replace(achieved_goal=jnp.full((B, 1), 10.0), next_achieved_goal=jnp.full((B, 1), 12.0), desired_goal=jnp.full((B, 1), 14.0))
+    columns, _ = agents._prepare(jax.random.key(1), start, batch, config)
+    np.testing.assert_array_equal(columns.inputs, np.tile([[5.0], [7.0], [1.0], [2.0]], (1, B)))
+    np.testing.assert_array_equal(columns.next_inputs, np.tile([[6.0], [7.0], [3.0], [4.0]], (1, B)))
 
 
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
 def test_an_update_in_blocks_is_the_same_update(precision, monkeypatch):
-    config = dataclasses.replace(CONFIG, bc_weight=0.5, num_critics=3, top_quantiles_to_drop_per_net=1, network_precision=precision)
+    config = with_agent(net_arch=(5, 10), bc_weight=0.5, num_critics=3, top_quantiles_to_drop_per_net=1, network_precision=precision)
     rng = np.random.default_rng(0)
     batch = make_batch(
         action=rng.uniform(-1, 1, (B, 1)),
@@ -311,16 +241,20 @@ def test_an_update_in_blocks_is_the_same_update(precision, monkeypatch):
         observation=rng.normal(size=(B, 2)),
         next_observation=rng.normal(size=(B, 2)),
         is_demonstration=np.arange(B) < 5,
-    ).replace(weight=jnp.asarray(rng.uniform(size=B), jnp.float32))
-    start = jax.jit(lambda key: agents.init(key, config, observation_dim=2, goal_dim=1, action_dim=1))(jax.random.key(0))
-    inputs, next_inputs = inputs_of(batch.observation, config), inputs_of(batch.next_observation, config)
+    ).replace(weight=jnp.asarray(rng.uniform(size=B), jnp.float32), obtained_return=jnp.asarray(rng.normal(size=B), jnp.float32))
+    start = fresh_agent(jax.random.key(0), config)
+    asked = []
 
     def update(num_blocks):
-        monkeypatch.setattr(agents, "_num_blocks", lambda *_: num_blocks)
-        once = jax.jit(lambda key: agents.update(key, start, batch, inputs=inputs, next_inputs=next_inputs, schedule=SCHEDULE, config=config))
-        return once(jax.random.key(1))
+        def say(*size):
+            asked.append(size)
+            return num_blocks
+
+        monkeypatch.setattr(agents, "num_blocks", say)
+        return jax.jit(lambda key: agents.update(key, start, batch, schedule_of(config), config))(jax.random.key(1))
 
     whole, cut = update(1), update(4)
+    assert asked == [(B, 10)] * 2  # the rows, and the widest layer
     # Adam's first step is the gradient's sign times the step size, so the moments are what must agree closely.
     for given, expected in ((cut[0].critic_optimiser, whole[0].critic_optimiser), (cut[0].actor_optimiser, whole[0].actor_optimiser)):
         chex.assert_trees_all_close(given, expected, rtol=1e-3, atol=1e-6)

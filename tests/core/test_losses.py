@@ -1,19 +1,11 @@
-"""Losses: worked by hand, and against plain loops and plain formulas."""
+"""Losses, worked by hand."""
 
-import hypothesis
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import strategies as st
 
-from hindrl_jax.core import losses
-from hindrl_jax.core.losses import behaviour_cloning, drop_largest, entropy_coefficient, quantile_huber, quantile_midpoints, target_atoms
-
-
-def test_quantile_midpoints():
-    np.testing.assert_allclose(quantile_midpoints(2), [0.25, 0.75])
-    np.testing.assert_allclose(quantile_midpoints(5), [0.1, 0.3, 0.5, 0.7, 0.9], rtol=1e-6)
+from hindrl_jax.core.losses import behaviour_cloning, entropy_coefficient, quantile_huber, squared_error, target_atoms, target_value
 
 
 @pytest.mark.parametrize(
@@ -54,63 +46,6 @@ def test_quantile_huber_averages_over_quantiles():
     np.testing.assert_allclose(quantile_huber(jnp.zeros((3, 25, 2)), jnp.ones((46, 2))), np.full((3, 2), 0.25), rtol=1e-6)
 
 
-def plain_quantile_huber(quantiles, targets):
-    """The formula of Dabney et al. (2018) with every pair written out: (N, Q, B), (M, B) -> (N, B)."""
-    num_quantiles = quantiles.shape[1]
-    midpoints = ((jnp.arange(num_quantiles) + 0.5) / num_quantiles).reshape(1, 1, -1, 1)
-    error = targets[None, :, None, :] - quantiles[:, None]  # (N, M, Q, B)
-    huber = jnp.where(jnp.abs(error) <= 1.0, 0.5 * error**2, jnp.abs(error) - 0.5)
-    return jnp.mean(jnp.abs(midpoints - (error < 0.0)) * huber, axis=(1, 2))
-
-
-@pytest.mark.parametrize("form", [losses._quantile_huber_in_one_pass, losses._quantile_huber_of_all_pairs])
-def test_loss_and_gradient_are_those_of_the_plain_formula(form, monkeypatch):
-    """Both forms, though only one of them runs on this machine's kind of device."""
-    monkeypatch.setattr(losses, "_quantile_huber_and_gradient", form)
-    jax.clear_caches()
-    rng = np.random.default_rng(0)
-    with jax.enable_x64(True):
-        # Errors of either sign on both sides of 1, and weights that differ between critics and rows.
-        quantiles, targets = jnp.asarray(2.0 * rng.normal(size=(2, 5, 7))), jnp.asarray(2.0 * rng.normal(size=(8, 7)))
-        weights = jnp.asarray(rng.normal(size=(2, 7)))
-        value, gradient = jax.jit(jax.value_and_grad(lambda q, z: jnp.sum(weights * quantile_huber(q, z)), argnums=(0, 1)))(quantiles, targets)
-        expected, plain = jax.jit(jax.value_and_grad(lambda q, z: jnp.sum(weights * plain_quantile_huber(q, z))))(quantiles, targets)
-        assert value.dtype == jnp.float64
-        # The midpoints are float32 numbers: 1/10 and so on are off by up to 3e-8.
-        np.testing.assert_allclose(value, expected, rtol=1e-6)
-        np.testing.assert_allclose(gradient[0], plain, rtol=1e-6, atol=1e-9)
-        assert np.all(np.asarray(gradient[1]) == 0.0)  # targets are constants
-
-
-jitted_drop = jax.jit(drop_largest, static_argnums=1)
-
-
-@hypothesis.settings(deadline=None, max_examples=40)
-@hypothesis.given(
-    atoms=st.lists(st.lists(st.integers(-3, 3), min_size=6, max_size=6), min_size=3, max_size=3),
-    num_dropped=st.sampled_from([0, 1, 3, 5]),
-)
-def test_drop_largest_is_that_of_a_sort(atoms, num_dropped):
-    atoms = np.array(atoms, np.float32).T  # integers from a small range: ties and negative numbers abound
-    expected = np.sort(atoms, axis=0)[: 6 - num_dropped]
-    np.testing.assert_array_equal(np.sort(jitted_drop(jnp.asarray(atoms), num_dropped), axis=0), expected)
-
-
-@pytest.mark.parametrize("form", [losses._drop_by_registers, losses._drop_by_sorting])
-@pytest.mark.parametrize("num_dropped", [1, 2, 5])
-def test_both_forms_of_truncation_keep_the_same_atoms(form, num_dropped):
-    atoms = np.random.default_rng(0).integers(-3, 3, size=(6, 11)).astype(np.float32)
-    expected = np.sort(atoms, axis=0)[: 6 - num_dropped]
-    np.testing.assert_array_equal(np.sort(form(jnp.asarray(atoms), num_dropped=num_dropped), axis=0), expected)
-
-
-def test_drop_largest_by_hand():
-    # Column 0 has a tie for the largest, of which one copy goes; column 1 is negative throughout.
-    atoms = jnp.array([[2.0, -1.0], [5.0, -4.0], [5.0, -2.0], [1.0, -3.0]])
-    np.testing.assert_array_equal(np.sort(drop_largest(atoms, 1), axis=0), [[1.0, -4.0], [2.0, -3.0], [5.0, -2.0]])
-    np.testing.assert_array_equal(drop_largest(atoms, 0), atoms)
-
-
 def test_target_atoms_by_hand():
     # Row 0: of 1, 4, 2 the 4 goes; 0.5 + 0.9 * (1 - 0.1) = 1.31 and 0.5 + 0.9 * (2 - 0.1) = 2.21. Row 1 has ended: only the reward is left.
     atoms = target_atoms(
@@ -121,6 +56,24 @@ def test_target_atoms_by_hand():
         num_dropped=1,
     )
     np.testing.assert_allclose(np.sort(atoms, axis=0), [[1.31, 1.0], [2.21, 1.0]], rtol=1e-6)
+
+
+def test_target_value_by_hand():
+    # Row 0: the least of 4 and 2 is 2; 1 + 0.5 * (2 - 0.4) = 1.8. Row 1: the least of 3 and 5 is 3, but it has ended: only the reward is left.
+    given = dict(reward=jnp.array([1.0, 0.3]), discount=jnp.array([0.5, 0.0]), entropy_bonus=jnp.array([-0.4, 7.0]))
+    value, gradient = jax.value_and_grad(lambda values: target_value(values, **given).sum())(jnp.array([[4.0, 3.0], [2.0, 5.0]]))
+    np.testing.assert_allclose(value, 1.8 + 0.3, rtol=1e-6)
+    np.testing.assert_allclose(target_value(jnp.array([[4.0, 3.0], [2.0, 5.0]]), **given), [[1.8, 0.3]], rtol=1e-6)
+    assert not gradient.any()
+
+
+def test_squared_error_by_hand():
+    # Halves of 2^2 and 1^2 for the first critic, of 0 and 3^2 for the second; the derivative is the difference.
+    values, target = jnp.array([[3.0, 1.0], [1.0, 5.0]]), jnp.array([1.0, 2.0])
+    np.testing.assert_allclose(squared_error(values, target), [[2.0, 0.5], [0.0, 4.5]], rtol=1e-6)
+    by_values, by_target = jax.grad(lambda *given: squared_error(*given).sum(), argnums=(0, 1))(values, target)
+    np.testing.assert_allclose(by_values, [[2.0, -1.0], [0.0, 3.0]], rtol=1e-6)
+    assert not by_target.any()
 
 
 def test_target_atoms_pass_no_gradient():

@@ -1,0 +1,107 @@
+"""The first 20 updates of each model, as numbers that were recorded once.
+
+They say that the algorithm is the same as before, not that it is right: a change that is meant to change it records them again, which the
+function `record` does (`python tests/core/test_golden.py`), and says so. The file was first made by the code as it was before it was taken
+apart into rooms.
+
+Numbers are compared to a thousandth, or 1e-5 where they are near 0. Another processor or version of XLA adds in another order, and what that
+changes grows along a run, to some 1e-4 after 40 updates; whatever draws another random number, or takes another branch, changes far more.
+"""
+
+import dataclasses
+import functools
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import hindrl_jax
+from hindrl_jax.core import train
+from hindrl_jax.core.guidance import guidance
+
+FILE = Path(__file__).parent.parent / "data" / "golden.json"
+NUM_UPDATES = 20
+GRID, REACH, RANDOM_REACH = "FixedGridPickAndPlace", "FixedParameterizedReach", "ParameterizedReach"
+CASES = {  # environment, model and kind of preset
+    "grid-bc": (GRID, "bc", "default"),
+    "grid-tqcfd": (GRID, "tqcfd", "default"),
+    "grid-hindrl": (GRID, "hindrl", "default"),
+    "grid-smooth-hindrl": (GRID, "smooth-hindrl", "default"),
+    "reach-hindrl": (REACH, "hindrl", "default"),
+    "random-reach": (RANDOM_REACH, "hindrl", "default"),
+    "thesis-grid-hindrl": (GRID, "hindrl", "thesis"),
+    "original-grid-hindrl": (GRID, "hindrl", "original"),
+}
+
+
+@functools.cache
+def environment_and_demonstrations(name):
+    env = hindrl_jax.make(name)
+    return env, hindrl_jax.record_demonstrations(env, 3, seed=3)
+
+
+def small_config(algo, kind, env):
+    """The preset with little of everything that costs time."""
+    config = hindrl_jax.preset(algo, kind, env=env)
+    batch, agent = dataclasses.replace(config.batch, batch_size=64), dataclasses.replace(config.agent, net_arch=(16, 16))
+    return dataclasses.replace(config, num_envs=4, updates_per_iteration=1, learning_starts=0, buffer_size=4000, batch=batch, agent=agent)
+
+
+PROGRAMS = {}
+
+
+def compiled(function, *arguments):
+    """The function's result. Compiling takes nearly all of the time here, so cases whose programs come out the same share them."""
+    lowered = jax.jit(function).lower(*arguments)
+    text = lowered.as_text()
+    if text not in PROGRAMS:
+        PROGRAMS[text] = lowered.compile()
+    return PROGRAMS[text](*arguments)
+
+
+def run(case):
+    """Each metric of the first updates, and after them the sums of the sizes of all parameters, by names that begin with the case's."""
+    env_name, algo, kind = CASES[case]
+    env, demonstrations = environment_and_demonstrations(env_name)
+    config = small_config(algo, kind, env)
+    given = dict(env=env, config=config)
+
+    def updates(state, data):
+        step = train.learn if config.learns_from_rollouts else train.clone
+        return jax.lax.scan(lambda state, _: step(state, data, **given, num_iterations=1), state, length=NUM_UPDATES)
+
+    data = compiled(lambda demonstrations: guidance(demonstrations, **given), demonstrations)
+    state = compiled(lambda key, data: train.init(key, data, **given), jax.random.key(7), data)
+    if config.learns_from_rollouts:
+        num_iterations = train.warm_up_iterations(env, config)
+        state = compiled(lambda state, data: train.collect(state, data, **given, num_iterations=num_iterations), state, data)
+    state, metrics = compiled(updates, state, data)
+    for name in ("actor", "critics"):
+        metrics[f"{name}/size"] = sum(np.abs(leaf).sum() for leaf in jax.tree.leaves(getattr(state.agent, name)))
+    return {f"{case} {name}": np.atleast_1d(values).tolist() for name, values in metrics.items()}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_first_updates_are_what_they_were(case):
+    recorded = {name: values for name, values in json.loads(FILE.read_text()).items() if name.split()[0] == case}
+    found = run(case)
+    assert recorded.keys() == found.keys()
+    for name, values in recorded.items():
+        np.testing.assert_allclose(found[name], values, rtol=1e-3, atol=1e-5, err_msg=name)
+
+
+def write(numbers):
+    """Numbers by name, to six digits and a line each, to the file."""
+    lines = [f'"{name}": [{", ".join(f"{value:.6g}" for value in values)}]' for name, values in sorted(numbers.items())]
+    FILE.write_text("{\n" + ",\n".join(lines) + "\n}\n")
+
+
+def record():
+    """Records the numbers of the code as it is."""
+    write({name: values for case in CASES for name, values in run(case).items()})
+
+
+if __name__ == "__main__":
+    record()
