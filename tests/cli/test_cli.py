@@ -22,7 +22,8 @@ from commands import refusal
 from PIL import Image
 
 from hindrl_jax import cli
-from hindrl_jax.cli import training
+from hindrl_jax.cli.running import demonstrations_of
+from hindrl_jax.cli.train_options import parse_train
 from hindrl_jax.runs.reader import load_run
 from hindrl_jax.runs.spec import read_spec
 from hindrl_jax.tasks.presets import preset
@@ -86,10 +87,10 @@ def test_an_interrupt_does_not_outlive_its_command(monkeypatch):
 
 def test_options_that_change_nothing_are_warned_about():
     with pytest.warns(UserWarning, match="num_quantiles = 50 changes nothing: sac has no quantiles"):
-        training.parse_train(["--base", "sac", "--num-quantiles", "50"])
+        parse_train(["--base", "sac", "--num-quantiles", "50"])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        training.parse_train(["--base", "sac", "--num-critics", "3"])
+        parse_train(["--base", "sac", "--num-critics", "3"])
 
 
 def test_run_directory_holds_what_it_promises(run):
@@ -126,7 +127,7 @@ def test_config_runs_again_and_other_flags_change_it(run, tmp_path):
     with np.load(run / "parameters.npz") as first, np.load(again / "parameters.npz") as second:
         for name in first.files:
             np.testing.assert_array_equal(first[name], second[name])
-    spec, _ = training.parse_train(["--config", str(run / "config.json"), "--learning-rate", "0.5", "--seeds", "1"])
+    spec, _ = parse_train(["--config", str(run / "config.json"), "--learning-rate", "0.5", "--seeds", "1"])
     assert (spec.config.agent.learning_rate, spec.seeds, spec.config.batch.batch_size) == (0.5, (5,), 16)
 
 
@@ -226,7 +227,7 @@ def test_eval_and_render_read_the_run_back(run, tmp_path, capsys):
 
 
 def test_the_configuration_keeps_its_number_of_seeds(run):
-    spec, _ = training.parse_train(["--config", str(run), "--seed", "100"])
+    spec, _ = parse_train(["--config", str(run), "--seed", "100"])
     assert spec.seeds == (100, 101)
 
 
@@ -245,9 +246,9 @@ def test_drawing_into_nowhere_is_refused(run, demos_file, tmp_path, capsys):
 def test_unsolved_demonstrations_are_dropped_with_a_warning(demos_file, capsys):
     with h5py.File(demos_file, "r+") as file:
         file["data/demo_0/dones"][-1] = 0
-    spec, _ = training.parse_train(["--demos", str(demos_file)])
+    spec, _ = parse_train(["--demos", str(demos_file)])
     with pytest.warns(UserWarning, match="1 of 2"):
-        (demonstrations,) = training.demonstrations_of(spec)
+        (demonstrations,) = demonstrations_of(spec)
     assert demonstrations.lengths.shape == (1,)
     with h5py.File(demos_file, "r+") as file:
         file["data/demo_1/dones"][-1] = 0
@@ -255,8 +256,8 @@ def test_unsolved_demonstrations_are_dropped_with_a_warning(demos_file, capsys):
 
 
 def test_the_original_preset_plays_by_the_original_rules():
-    assert training.parse_train(["--preset", "original"])[0].env.strict_order is False
-    assert training.parse_train(["--preset", "thesis"])[0].env.strict_order is True
+    assert parse_train(["--preset", "original"])[0].env.strict_order is False
+    assert parse_train(["--preset", "thesis"])[0].env.strict_order is True
 
 
 README_COMMANDS = re.findall(r"^hindrl train ([^#\n]*)", (Path(__file__).parent.parent.parent / "README.md").read_text(), re.MULTILINE)
@@ -265,7 +266,7 @@ README_COMMANDS = re.findall(r"^hindrl train ([^#\n]*)", (Path(__file__).parent.
 @pytest.mark.parametrize("command", README_COMMANDS)
 def test_commands_of_the_readme_parse(command, run):
     arguments = [str(run) if word == "runs/eight" and "--config" in command else word for word in shlex.split(command)]
-    training.parse_train(arguments)
+    parse_train(arguments)
 
 
 def test_existing_run_is_refused_and_kept(run, capsys):
@@ -337,9 +338,9 @@ def test_demonstrations_longer_than_the_horizon_are_dropped_with_a_warning(demos
     with h5py.File(demos_file) as file:
         lengths = sorted(file[f"data/demo_{i}"].attrs["num_samples"] for i in range(2))
     assert lengths[0] < lengths[1]
-    spec, _ = training.parse_train(["--demos", str(demos_file), "--horizon", str(lengths[0])])
+    spec, _ = parse_train(["--demos", str(demos_file), "--horizon", str(lengths[0])])
     with pytest.warns(UserWarning, match="1 of 2"):
-        (demonstrations,) = training.demonstrations_of(spec)
+        (demonstrations,) = demonstrations_of(spec)
     assert demonstrations.lengths.tolist() == [lengths[0]]
     assert "horizon" in refusal(capsys, "train", "--demos", demos_file, "--horizon", lengths[0] - 1)
 
@@ -388,7 +389,7 @@ def test_every_config_field_is_a_flag(capsys):
 
 def test_flags_of_each_type():
     arguments = ["--batch-size", "64", "--strict-goal-test", "--target-entropy", "-2.5", "--reach-zero", "None", "--num-objects", "3"]
-    spec, _ = training.parse_train(arguments)
+    spec, _ = parse_train(arguments)
     assert (spec.config.batch.batch_size, spec.config.batch.inclusive_goal_test) == (64, False)
     assert (spec.config.agent.target_entropy, spec.config.batch.reach_zero, spec.env.num_objects) == (-2.5, None, 3)
 
@@ -396,14 +397,14 @@ def test_flags_of_each_type():
 @pytest.mark.parametrize("algo", ["bc", "tqcfd", "hindrl", "smooth-hindrl"])
 @pytest.mark.parametrize("preset", ["default", "thesis", "original"])
 def test_presets_parse_and_survive_the_configuration_file(algo, preset, tmp_path):
-    spec, _ = training.parse_train(["--algo", algo, "--preset", preset])
+    spec, _ = parse_train(["--algo", algo, "--preset", preset])
     path = tmp_path / "config.json"
     path.write_text(json.dumps(spec.to_json()))
     assert read_spec(path) == spec
 
 
 def test_configuration_files_are_checked_field_by_field(tmp_path, capsys):
-    spec, _ = training.parse_train([])
+    spec, _ = parse_train([])
     good = spec.to_json()
     path = tmp_path / "config.json"
 
