@@ -1,8 +1,15 @@
-"""Commands that must be refused."""
+"""Commands: of a training that takes seconds, and such that must be refused."""
+
+import shlex
 
 import pytest
 
 from hindrl_jax import cli
+
+TINY = shlex.split(
+    "--num-envs 2 --learning-starts 200 --steps 260 --eval-every 40 --eval-episodes 3 --updates-per-iteration 1 "
+    "--batch-size 16 --net-arch 8 --buffer-size 2000"
+)
 
 
 def refusal(capsys, *arguments) -> str:

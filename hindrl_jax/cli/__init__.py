@@ -1,14 +1,14 @@
-"""The `hindrl` command. Every failure that is the user's to mend is one line on standard error and exit code 2."""
+"""The `hindrl` command: what is typed, and what is printed. Every failure that is the user's to mend is one line on standard error and exit code 2.
+
+`main` runs a command, and `COMMANDS` lists them: a function of the arguments for each, which stands in the module of its kind.
+"""
 
 from __future__ import annotations
 
-import contextlib
 import os
-import signal
 import sys
-import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +16,14 @@ import jax
 
 from hindrl_jax import __version__
 from hindrl_jax.base.errors import UserError, one_line
-from hindrl_jax.cli import comparison, demonstrations, environments, playing, reproduction, training
+from hindrl_jax.cli import comparison, demonstrations, environments, playing, reproduction, sweeping, training
+from hindrl_jax.cli.signals import interrupts_that_last
 from hindrl_jax.tasks.registry import did_you_mean
 
 Command = Callable[[list[str]], None]
 COMMANDS: dict[str, Command | dict[str, Command]] = {
     "train": training.train,
-    "sweep": training.sweep,
+    "sweep": sweeping.sweep,
     "eval": playing.evaluate,
     "render": playing.render,
     "compare": comparison.compare,
@@ -76,34 +77,6 @@ def _set_up_jax() -> None:
         jax.config.update("jax_num_cpu_devices", cores or 1)
 
 
-@contextlib.contextmanager
-def _interrupts_that_last() -> Iterator[None]:
-    """A Ctrl-C that falls into a callback of the interpreter, of which JAX has one for garbage collection, is forgotten there: it is sent again."""
-    hook, timers, main_thread = sys.unraisablehook, [], threading.main_thread().ident
-
-    def send() -> None:
-        if main_thread is not None and hasattr(signal, "pthread_kill"):
-            signal.pthread_kill(main_thread, signal.SIGINT)  # unlike raise_signal, it wakes what waits
-        else:
-            signal.raise_signal(signal.SIGINT)
-
-    def send_again(unraisable: Any) -> None:
-        if not issubclass(unraisable.exc_type, KeyboardInterrupt):
-            return hook(unraisable)
-        timers.append(threading.Timer(0.1, send))
-        timers[-1].daemon = True
-        timers[-1].start()
-
-    sys.unraisablehook = send_again
-    try:
-        yield
-    finally:
-        if sys.unraisablehook is send_again:  # else somebody who needs it longer has put another before it
-            sys.unraisablehook = hook
-        for timer in timers:
-            timer.cancel()
-
-
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the `hindrl` command; with arguments given, runs within this process as it is."""
     if arguments is None:
@@ -114,7 +87,7 @@ def main(arguments: list[str] | None = None) -> None:
         if last in ("--help", "-h") and (not group or (len(group) == 1 and isinstance(COMMANDS.get(group[0]), dict))):
             print(_usage(), flush=True)
             return
-        with warnings.catch_warnings(), _interrupts_that_last():
+        with warnings.catch_warnings(), interrupts_that_last():
             warnings.showwarning = lambda message, *_, **__: print(f"hindrl: warning: {message}", file=sys.stderr)
             command, rest = _find(arguments)
             command(rest)

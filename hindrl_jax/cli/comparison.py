@@ -15,10 +15,11 @@ from rich.table import Table
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.files import disk_trouble
 from hindrl_jax.cli.common import console, parse
-from hindrl_jax.plotting import curves as plots
 from hindrl_jax.plotting.statistics import Interval
-from hindrl_jax.reporting.compare import Axis, Comparison, changes, find_runs, read_runs, remarks, write_csv
+from hindrl_jax.reporting.compare import Comparison, changes, find_runs, read_runs, remarks, write_csv
 from hindrl_jax.reporting.compare import compare as compared_runs
+from hindrl_jax.reporting.picture import save_comparison
+from hindrl_jax.runs.recorded import Axis
 
 _MOST_CHANGES = 6  # that are named for each run
 _TABLE_WIDTH = 160  # at most, also where the terminal is narrower: a cell in two lines is hard to compare
@@ -61,7 +62,7 @@ def compare(arguments: list[str]) -> None:
     if options.to is not None:
         over: Any = "updates" if options.over == "steps" and all(run.cloning for run in runs) else options.over
         with disk_trouble(options.to):
-            plots.save_comparison(runs, options.to, over=over)
+            save_comparison(runs, options.to, over=over)
         console.print(f"wrote {options.to}")
 
 

@@ -15,7 +15,9 @@ from rich.table import Table
 
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.cli.common import console, counted, parse, seeds_from
-from hindrl_jax.reproduction import ablation
+from hindrl_jax.reproduction import ablation, cells
+from hindrl_jax.reproduction.options import OPTIONS
+from hindrl_jax.reproduction.outcomes import Outcome, outcomes_of
 from hindrl_jax.tasks.registry import did_you_mean
 from hindrl_jax.training.checks import steps_to_learn
 from hindrl_jax.training.result import Result
@@ -29,14 +31,14 @@ class Ablation:
     """Directory of the tables and of all runs. Started again with the same options, what is finished there is kept and the rest is trained."""
     tasks: tuple[str, ...] = ()
     """What to train on: fixed-1, fixed-5 or random-50, the fixed or the random grid with that many demonstrations (default: all)."""
-    levers: tuple[str, ...] = ()
+    options: tuple[str, ...] = ()
     """The changes to train, next to the recipe without any (default: all; --list shows them)."""
     seeds: int = 16
     """Number of seeds, side by side; the same for all changes. With fewer than 8 or so the intervals are much too narrow."""
     seed: int = 2_000
     """The first seed; the others follow it."""
     steps: int | None = None
-    """Environment steps of each run (default: the recipe's until its agent begins anew)."""
+    """Environment steps of each run (default: the recipe's until its agent is reset)."""
     overwrite: bool = False
     """Replace runs that were made with other options. To train one again with the same options, remove its directory."""
     list: bool = False
@@ -45,42 +47,42 @@ class Ablation:
 
 def ablate(arguments: list[str]) -> None:
     """Train the default recipe with one change at a time, and compare."""
-    options = parse(Ablation, arguments, "hindrl reproduce ablation", ablate.__doc__)
-    if options.list:
-        console.print(_lever_table())
+    given = parse(Ablation, arguments, "hindrl reproduce ablation", ablate.__doc__)
+    if given.list:
+        console.print(_option_table())
         return
-    tasks = _chosen(options.tasks, ablation.ABLATION_TASKS, "--tasks")
-    levers = {lever.name: lever for lever in ablation.LEVERS}
-    names = _chosen(options.levers, levers, "--levers")
-    if options.seeds < 2:
-        raise UserError(f"--seeds {options.seeds} is too few: an interval needs at least 2")
-    settings_of = functools.partial(ablation.settings_of, options.out, seeds=seeds_from(options.seeds, options.seed), steps=options.steps)
-    settings = settings_of(tasks=tasks, levers=[levers[name] for name in names])
-    # The tables hold all that is there, also from an earlier start with other levers, so all of it must be of the same options.
-    everything = settings_of(tasks=ablation.ABLATION_TASKS, levers=ablation.LEVERS)
-    ablation.check_can_train(settings if options.overwrite else everything, overwrite=options.overwrite)
-    for setting in settings:
-        steps_to_learn(setting.spec.env, setting.spec.config)
-    to_train = [setting for setting in settings if not ablation.is_finished(setting)]
-    kept = len(settings) - len(to_train)
-    console.print(f"{counted(len(to_train), 'setting')} to train, {counted(options.seeds, 'seed')} from {options.seed}, {kept} finished before")
+    tasks = _chosen(given.tasks, ablation.TASKS, "--tasks")
+    known = {option.name: option for option in OPTIONS}
+    names = _chosen(given.options, known, "--options")
+    if given.seeds < 2:
+        raise UserError(f"--seeds {given.seeds} is too few: an interval needs at least 2")
+    cells_of = functools.partial(ablation.cells_of, given.out, seeds=seeds_from(given.seeds, given.seed), steps=given.steps)
+    chosen = cells_of(tasks=tasks, options=[known[name] for name in names])
+    # The tables hold all that is there, also from an earlier start with other options, so all of it must be of the same seeds and steps.
+    everything = cells_of(tasks=ablation.TASKS, options=OPTIONS)
+    cells.check_can_train(chosen if given.overwrite else everything, overwrite=given.overwrite)
+    for cell in chosen:
+        steps_to_learn(cell.spec.env, cell.spec.config)
+    to_train = [cell for cell in chosen if not cells.is_finished(cell)]
+    kept = len(chosen) - len(to_train)
+    console.print(f"{counted(len(to_train), 'setting')} to train, {counted(given.seeds, 'seed')} from {given.seed}, {kept} finished before")
 
     started = time.perf_counter()
     with _bars() as progress:
-        for trained, setting in enumerate(to_train, 1):
-            name = f"{setting.task} {setting.lever.name}: "
-            bar = progress.add_task(f"{name}compiling", total=setting.spec.config.steps, rates="")
-            ablation.train(setting, report=functools.partial(_advance, progress, bar, name))
+        for trained, cell in enumerate(to_train, 1):
+            name = f"{cell.task} {cell.name}: "
+            bar = progress.add_task(f"{name}compiling", total=cell.spec.config.steps, rates="")
+            cells.train(cell, report=functools.partial(_advance, progress, bar, name))
             progress.remove_task(bar)
-            outcomes = ablation.outcomes_of(everything)
-            ablation.write_tables(options.out, outcomes)
+            outcomes = outcomes_of(everything)
+            ablation.write_tables(given.out, outcomes)
             left = len(to_train) - trained
             minutes = (time.perf_counter() - started) / trained * left / 60
-            (outcome,) = (outcome for outcome in outcomes if outcome.setting == setting)
+            (outcome,) = (outcome for outcome in outcomes if outcome.cell == cell)
             progress.console.print(_outcome_line(outcome) + (f"   {left} left, about {minutes:,.0f} min" if left else ""))
     if not to_train:
-        ablation.write_tables(options.out, ablation.outcomes_of(everything))
-    console.print(f"wrote {options.out}: {ablation.TABLE}, {ablation.TEXT}, {ablation.PICTURE}, and a run's directory for each setting")
+        ablation.write_tables(given.out, outcomes_of(everything))
+    console.print(f"wrote {given.out}: {ablation.TABLE}, {ablation.TEXT}, {ablation.PICTURE}, and a run's directory for each setting")
 
 
 def _bars() -> Progress:
@@ -110,17 +112,17 @@ def _chosen(names: Sequence[str], known: Iterable[str], flag: str) -> list[str]:
     return [name for name in known if name in names or not names]
 
 
-def _lever_table() -> Table:
-    table = Table("lever", "group", "what it changes", box=box.SIMPLE_HEAD)
-    for lever in ablation.LEVERS:
-        table.add_row(lever.name, lever.group, lever.summary)
+def _option_table() -> Table:
+    table = Table("option", "group", "what it changes", box=box.SIMPLE_HEAD)
+    for option in OPTIONS:
+        table.add_row(option.name, option.group, option.summary)
     return table
 
 
-def _outcome_line(outcome: ablation.Outcome) -> str:
-    spec, steps = outcome.setting.spec, outcome.steps_to_95.estimate
+def _outcome_line(outcome: Outcome) -> str:
+    spec, steps = outcome.cell.spec, outcome.steps_to_95.estimate
     median = f"median {steps:9,.0f} steps" if np.isfinite(steps) else f"median {'never':>9}      "
     return (
-        f"{outcome.setting.task:<10}{outcome.setting.lever.name:<22}{outcome.seeds_reaching_95:3d} of {len(spec.seeds)} reach 95%, {median}   "
+        f"{outcome.cell.task:<10}{outcome.cell.name:<22}{outcome.seeds_reaching_95:3d} of {len(spec.seeds)} reach 95%, {median}   "
         f"final {outcome.final_success.estimate:4.0%}   {outcome.seconds_per_seed * len(spec.seeds):6.1f} s"
     )

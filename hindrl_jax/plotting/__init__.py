@@ -1,4 +1,5 @@
-"""Pictures, films and the statistics that they show.
+"""Pictures, films and statistics of trainings: what is drawn of a result and of a task, and what every other picture of the project is made with.
 
-Public are `curves` (Matplotlib), `films` (GIF, MP4 and PNG) and `statistics` (estimates over seeds with bootstrap intervals).
+`figures` has the helpers that pictures share, `statistics` the estimates with their bootstrap intervals, `curves` success over training and the
+epsilon filter, `films` episodes.
 """

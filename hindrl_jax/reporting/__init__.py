@@ -1,4 +1,4 @@
-"""How trainings go and went, for a person: while one runs, and several side by side afterwards.
+"""What is said of trainings to people: how one goes, on the screen, in TensorBoard or W&B, and how several went, side by side.
 
-Public are `progress` (`ProgressBar`), `reporters` (`TensorBoardReporter`, `WandbReporter`) and `compare`, which reads runs back and compares them.
+`progress` has the bar of a training under way, `reporters` what shows it elsewhere, `compare` sets recorded runs side by side, `picture` draws them.
 """

@@ -1,4 +1,4 @@
-"""Runs side by side, read back from their directories: finished ones, and those that are under way or were killed."""
+"""Runs side by side: each by itself, and beside the first."""
 
 from __future__ import annotations
 
@@ -8,54 +8,18 @@ import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from hindrl_jax.base.errors import UserError, one_line
+from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.files import disk_trouble
 from hindrl_jax.plotting.statistics import Interval, bootstrap, bootstrap_difference
-from hindrl_jax.runs.spec import CONFIG, METRICS, SUMMARY, RunSpec, read_spec
-from hindrl_jax.training.result import SOLVED
+from hindrl_jax.runs.recorded import RecordedRun, read_recorded
+from hindrl_jax.runs.spec import CONFIG
 
-Axis = Literal["steps", "updates", "seconds"]
 FEW_SEEDS = 8
 """With fewer, bootstrap intervals are much too narrow."""
-
-
-@dataclasses.dataclass(frozen=True)
-class RecordedRun:
-    """What a run's directory says about how it went: E evaluations of S seeds."""
-
-    path: Path
-    label: str
-    """A short name; those of runs that are read together differ."""
-    spec: RunSpec
-    env_steps: np.ndarray
-    """(E,) environment steps of each seed; 0 for bc."""
-    updates: np.ndarray
-    """(E,) gradient steps of each seed."""
-    seconds: np.ndarray
-    """(E,) of training, all seeds side by side."""
-    success: np.ndarray
-    """(E, S) share of an evaluation's episodes that are solved."""
-    final_success: np.ndarray
-    """(S,) of 100 fresh episodes; of the last evaluation, if the run is not finished."""
-    finished: bool
-
-    @property
-    def cloning(self) -> bool:
-        """Whether the run counts gradient steps alone."""
-        return self.spec.config.algo == "bc"
-
-    def axis(self, over: Axis) -> np.ndarray:
-        """(E,) what the evaluations are drawn over."""
-        return {"steps": self.env_steps, "updates": self.updates, "seconds": self.seconds}[over]
-
-    def to_95(self, over: Axis) -> np.ndarray:
-        """(S,) where each seed's first evaluation at 95% stands; infinite where there is none."""
-        reached = self.success >= SOLVED
-        return np.where(reached.any(axis=0), self.axis(over)[reached.argmax(axis=0)], np.inf)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +61,7 @@ def read_runs(paths: Sequence[Path]) -> list[RecordedRun]:
     Raises:
       UserError: if one is damaged, or has no evaluation yet.
     """
-    return [_read(path, label) for path, label in zip(paths, _labels(paths), strict=True)]
+    return [read_recorded(path, label) for path, label in zip(paths, _labels(paths), strict=True)]
 
 
 def compare(runs: Sequence[RecordedRun]) -> list[Comparison]:
@@ -192,37 +156,6 @@ def _compared(run: RecordedRun, first: RecordedRun) -> Comparison:
 
 def _without_interval(estimate: float) -> Interval:
     return Interval(estimate=estimate, low=-np.inf, high=np.inf)
-
-
-def _read(path: Path, label: str) -> RecordedRun:
-    spec = read_spec(path)
-    try:
-        text = (path / METRICS).read_text()
-        summary = json.loads((path / SUMMARY).read_text()) if (path / SUMMARY).exists() else None
-        lines = text[: text.rfind("\n") + 1].splitlines()  # what follows the last line's end is still being written
-        evaluations: dict[tuple[int, int], dict[int, dict[str, str]]] = {}
-        for row in csv.DictReader(lines):
-            evaluations.setdefault((int(row["env_steps"]), int(row["updates"])), {})[int(row["seed"])] = row
-        whole = [[rows[seed] for seed in spec.seeds] for rows in evaluations.values() if set(rows) == set(spec.seeds)]
-        column = {name: np.asarray([[float(row[name]) for row in rows] for rows in whole]) for name in ("env_steps", "updates", "seconds", "success")}
-        final = None if summary is None else np.asarray([float(seed["final_success"]) for seed in summary["seeds"]])
-    except FileNotFoundError:
-        raise UserError(f"{path} has no {METRICS} yet: wait for its first evaluation, or leave it out") from None
-    except (OSError, ValueError, LookupError, TypeError) as error:
-        raise UserError(f"{path} is damaged ({one_line(error)}): leave it out, or train again") from error
-    if not whole:
-        raise UserError(f"{path} has no evaluation of all its seeds yet: wait for the first, or leave it out")
-    return RecordedRun(
-        path=path,
-        label=label,
-        spec=spec,
-        env_steps=column["env_steps"][:, 0].astype(int),
-        updates=column["updates"][:, 0].astype(int),
-        seconds=column["seconds"][:, 0],
-        success=column["success"],
-        final_success=column["success"][-1] if final is None else final,
-        finished=final is not None,
-    )
 
 
 def _labels(paths: Sequence[Path]) -> list[str]:

@@ -1,4 +1,5 @@
-"""The directory of a run or a sweep: what was asked for, how it went, and the policies that came of it.
+"""A run's directory: what it was asked to do, written as the training goes, gone on with after a stop, and read back.
 
-Public are `spec` (`RunSpec`, what config.json says), `writer` (`save_run`), `reader` (`load_run`, `Run`), `sweep` and `checkpoints` (`Checkpoints`).
+`spec` is what a run was asked to do and the names of its files, `writer` and `sweep` write directories, `reporter` says whom else they tell,
+`checkpoints` is what a run goes on from, `reader` reads its policies back and `recorded` how it went.
 """

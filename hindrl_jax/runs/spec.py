@@ -15,16 +15,13 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.tasks.registry import did_you_mean, full_name, make
 from hindrl_jax.training.result import Row
-
-if TYPE_CHECKING:
-    pass
 
 CONFIG, METRICS, SUMMARY, PARAMETERS = "config.json", "metrics.csv", "summary.json", "parameters.npz"
 CURVE, EPISODE = "curve.png", "episode.gif"

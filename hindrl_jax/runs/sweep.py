@@ -8,7 +8,7 @@ import json
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
@@ -17,12 +17,10 @@ from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.base.files import disk_trouble, write_text_atomically
 from hindrl_jax.config import with_values
 from hindrl_jax.plotting import curves as plots
+from hindrl_jax.runs.reporter import Reporter
 from hindrl_jax.runs.spec import CHECKPOINTS, RUN_FILES, SWEEP, SWEEP_CURVES, SWEEP_SETTINGS, RunSpec, read_spec
 from hindrl_jax.runs.writer import RunWriter
 from hindrl_jax.training.result import Result
-
-if TYPE_CHECKING:
-    from hindrl_jax.reporting.reporters import Reporter
 
 
 class SweepWriter:

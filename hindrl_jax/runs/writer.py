@@ -1,14 +1,4 @@
-"""A run's directory: what it was asked to do, how it went, and the policies that came of it.
-
-    config.json       everything needed to run it again (`hindrl train --config`)
-    metrics.csv       a row per evaluation and seed, written as the run goes
-    summary.json      the outcome per seed and the totals
-    parameters.npz    networks and behavioural goals, leading axis the seeds; no pickle
-    curve.png, episode.gif
-    checkpoint/       while it is under way, or if it was stopped: what it needs to go on
-
-Each file is written whole or not at all, metrics.csv row by row.
-"""
+"""Writing a run's directory, see `spec`: each file whole or not at all, metrics.csv row by row."""
 
 from __future__ import annotations
 
@@ -23,7 +13,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import filelock
 import numpy as np
@@ -34,12 +24,10 @@ from hindrl_jax.base.files import disk_trouble, why_unwritable, write_text_atomi
 from hindrl_jax.base.steppers import Watchable
 from hindrl_jax.plotting import curves as plots
 from hindrl_jax.runs.reader import load_run
+from hindrl_jax.runs.reporter import Reporter
 from hindrl_jax.runs.spec import CHECKPOINTS, CONFIG, CURVE, EPISODE, FROM_PYTHON, LOCK, METRICS, PARAMETERS, ROW_FIELDS, RUN_FILES, SUMMARY, RunSpec
 from hindrl_jax.tasks.registry import viewer
 from hindrl_jax.training.result import Result, Row
-
-if TYPE_CHECKING:
-    from hindrl_jax.reporting.reporters import Reporter
 
 
 class RunWriter:

@@ -17,7 +17,7 @@ import pytest
 
 import hindrl_jax as hindrl
 from hindrl_jax import cli
-from hindrl_jax.cli import COMMANDS, training
+from hindrl_jax.cli import COMMANDS, running
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.runs.reader import load_run
 from hindrl_jax.runs.spec import RunSpec, read_spec
@@ -228,7 +228,8 @@ WORD = NUMBER | TEXT | st.sampled_from(["hindrl", "tqc", "thesis", "None", "True
 FLAG = st.sampled_from(
     shlex.split(
         "env algo preset config resume demos seeds seed out overwrite no-overwrite steps num-envs num-objects horizon size buffer-size batch-size "
-        "learning-rate gamma n-step bc-weight net-arch num-quantiles k m eval-every checkpoint-every over episodes to directory levers tasks "
+        "learning-rate gamma n-step bc-weight net-arch num-quantiles epsilon-steps epsilon-deviations eval-every checkpoint-every over episodes to "
+        "directory options tasks "
         "expert host num-hosts distributed coordinator epsilon-filtering strategy-mixture hindrl-sampling-strategy base backend num-waypoints"
     )
 )
@@ -248,10 +249,10 @@ def test_command_lines(words, arguments, *, tmp_path, monkeypatch, capsys, **_):
         raise WouldTrain
 
     for name in ("fit", "record_demonstrations"):
-        monkeypatch.setattr(training, name, would_train)
+        monkeypatch.setattr(running, name, would_train)
     monkeypatch.setattr("hindrl_jax.cli.demonstrations.record_demonstrations", would_train)
     monkeypatch.setattr("hindrl_jax.cli.demonstrations.record_by_hand", would_train)
-    monkeypatch.setattr("hindrl_jax.reproduction.ablation.train", would_train)
+    monkeypatch.setattr("hindrl_jax.reproduction.cells.train", would_train)
     monkeypatch.chdir(tmp_path)
     capsys.readouterr()
     status = 0

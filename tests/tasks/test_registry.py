@@ -15,7 +15,7 @@ from toy_env import Corridor
 import hindrl_jax as hindrl
 from hindrl_jax import cli
 from hindrl_jax.base.errors import UserError
-from hindrl_jax.cli.training import parse_train
+from hindrl_jax.cli.train_options import parse_train
 from hindrl_jax.envs import FixedGridPickAndPlace
 from hindrl_jax.runs.reader import draw_episodes
 from hindrl_jax.runs.spec import read_spec

@@ -1,0 +1,154 @@
+"""One training of `hindrl train` or `hindrl sweep`: what it is given, what is shown and kept on the way, and how it stops."""
+
+from __future__ import annotations
+
+import math
+import re
+import sys
+import time
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from hindrl_jax import STARTED
+from hindrl_jax.base.errors import UserError
+from hindrl_jax.base.types import Episodes
+from hindrl_jax.cli.common import console, counted
+from hindrl_jax.cli.signals import StopSignals
+from hindrl_jax.cli.train_options import ResumeOptions, TrainOptions, is_number
+from hindrl_jax.config import TrainConfig
+from hindrl_jax.demonstrations.convert import load
+from hindrl_jax.reporting.progress import ProgressBar
+from hindrl_jax.reporting.reporters import REPORTERS
+from hindrl_jax.runs.checkpoints import Checkpoints
+from hindrl_jax.runs.reporter import Reporter
+from hindrl_jax.runs.spec import CHECKPOINTS, FROM_PYTHON, RunSpec
+from hindrl_jax.runs.sweep import SweepWriter
+from hindrl_jax.runs.writer import RunWriter
+from hindrl_jax.training.experiment import Diverged, fit
+from hindrl_jax.training.recording import record_demonstrations
+from hindrl_jax.training.result import Result
+
+
+def default_out(spec: RunSpec, *words: str) -> Path:
+    """The directory of a run, or of a sweep, that was not given one: named after what it does, and the time."""
+    return Path("runs") / "_".join([re.sub(r"[:/]", "_", spec.env.name), spec.config.algo, *words, time.strftime("%Y%m%d_%H%M%S")])
+
+
+def check_unfinished(out: Path, last: str, advice: str) -> None:
+    """Refuses to resume what has all its files; the checkpoint is removed after the last of them."""
+    if (out / last).exists() and not (out / CHECKPOINTS).exists():
+        raise UserError(f"{out} is finished, so there is nothing to resume: {advice}")
+
+
+def checkpoints_of(out: Path, options: TrainOptions | ResumeOptions) -> Checkpoints | None:
+    """Where checkpoints are kept, if they are; None with several hosts."""
+    seconds = options.checkpoint_every
+    if not seconds >= 0:
+        raise UserError(f"--checkpoint-every {seconds} is not usable: give a number of seconds, or 0 for no checkpoints")
+    resumes = isinstance(options, ResumeOptions)
+    return Checkpoints(out / CHECKPOINTS, seconds=seconds or math.inf) if (seconds or resumes) and jax.process_count() == 1 else None
+
+
+def reporters_of(options: TrainOptions | ResumeOptions, resumed: Path | None = None) -> list[type[Reporter]]:
+    """The kinds that are asked for, and those that the run or the sweep which is resumed had before."""
+    before = [] if resumed is None else [path.name for path in (*resumed.glob("*"), *resumed.glob("*/*"))]
+    return [kind for kind in REPORTERS if getattr(options, kind.folder) or kind.folder in before]
+
+
+def demonstrations_of(spec: RunSpec) -> list[Episodes]:
+    """One table of demonstrations per seed."""
+    if spec.demos == FROM_PYTHON:
+        raise UserError("the demonstrations of this run were given from Python, not from a file: name others with --demos")
+    if is_number(spec.demos):
+        return [record_demonstrations(spec.env, int(spec.demos), seed=seed) for seed in spec.seeds]
+    episodes = load(spec.demos, spec.env)
+    solved = np.asarray(episodes.terminated)
+    if not solved.any():
+        raise UserError(f"{spec.demos}: none of its demonstrations solves the task, so there is no goal to learn: record others")
+    if not solved.all():
+        warnings.warn(f"{spec.demos}: dropped {(~solved).sum()} of {solved.size} demonstrations that do not solve the task", stacklevel=2)
+        episodes = jax.tree.map(lambda leaf: leaf[solved], episodes)
+    return [episodes] * len(spec.seeds)
+
+
+def run(spec: RunSpec, configs: Sequence[TrainConfig], writer: RunWriter | SweepWriter | None, checkpoints: Checkpoints | None) -> Result:
+    """Trains all seeds of all configs at once, with a progress bar; each of the writer's runs gets those of its config. Without it, quietly."""
+    resumes = writer is not None and writer.resume
+    demonstrations = checkpoints.load_demonstrations() if resumes and checkpoints.has_demonstrations else demonstrations_of(spec)
+    num_seeds = len(spec.seeds)
+    seeds = f"seed {spec.seeds[0]}" if num_seeds == 1 else f"{num_seeds} seeds from {spec.seeds[0]}"
+    settings = f", {len(configs)} settings" if len(configs) > 1 else ""
+    runs: dict[str, Any] = dict(seeds=spec.seeds * len(configs), config=[config for config in configs for _ in spec.seeds])
+    if writer is None:
+        return fit(spec.env, demonstrations * len(configs), **runs)
+    console.print(f"{spec.env.name}, {spec.config.algo}, {counted(demonstrations[0].lengths.shape[0], 'demonstration')}, {seeds}{settings}")
+
+    with ProgressBar(console=console) as progress, StopSignals() as stop_signals:
+        progress.wait("compiling")
+        learning = False
+
+        def begin(result: Result) -> None:
+            writer.start()
+            if checkpoints is not None:
+                checkpoints.save_demonstrations(demonstrations)
+            progress.say(f"compiled in {result.compile_seconds:.1f} s{_on_devices(result)}")
+            for share in spec.config.agent_resets:
+                progress.say(f"the agent begins anew at step {share * spec.config.steps:,.0f}, so success will drop there and come back")
+            if resumes:
+                progress.say(f"going on at step {result.steps_done:,}" if result.steps_done else "there is no checkpoint yet: beginning again")
+            stop_signals.note()
+
+        def report(result: Result) -> None:
+            nonlocal learning
+            if not writer.started:
+                begin(result)
+            elif not learning:
+                learning = True
+                progress.say(f"first updates after {time.perf_counter() - STARTED:.1f} s")
+            for index, of_setting in enumerate(writer.runs):
+                of_setting.report(result.rows_of(slice(index * num_seeds, (index + 1) * num_seeds)))
+            progress(result)
+            if checkpoints is not None:
+                checkpoints.save_when_due(result)
+            if stop_signals.received is not None and result.final_success is None:
+                progress.close()
+                _stop(result, stop_signals.received, writer, checkpoints)
+
+        restore: dict[str, Any] = {} if checkpoints is None else {"restore": checkpoints.restore}
+        try:
+            return fit(spec.env, demonstrations * len(configs), **runs, report=report, **restore)
+        except Diverged as error:
+            if checkpoints is None or checkpoints.steps is None:
+                raise
+            raise UserError(f"{error}; the last good checkpoint, of step {checkpoints.steps}, is in {checkpoints.folder}") from error
+
+
+def speed_line(summary: dict[str, Any]) -> str:
+    """How fast a training was, from its summary."""
+    env_steps = f" and {summary['env_steps_per_second']:,.0f} environment steps/s" if summary["env_steps_per_second"] else ""
+    return (
+        f"{summary['updates_per_second']:,.0f} updates/s{env_steps} over all seeds, "
+        f"{summary['train_seconds']:.1f} s of training after {summary['compile_seconds']:.1f} s of compilation, "
+        f"peak memory {summary['peak_memory_bytes'] / 2**20:,.0f} MiB"
+    )
+
+
+def _stop(result: Result, number: int, writer: RunWriter | SweepWriter, checkpoints: Checkpoints | None) -> None:
+    """Ends the process as the signal asks, with a checkpoint."""
+    if checkpoints is None:
+        said = "no checkpoint was asked for"
+    else:
+        checkpoints.save(result)
+        said = f"go on with `hindrl {'sweep' if isinstance(writer, SweepWriter) else 'train'} --resume {writer.path}`"
+    print(f"hindrl: stopped after {result.steps_done:,} of {result.config.steps:,} steps; {said}", file=sys.stderr)
+    sys.exit(128 + number)
+
+
+def _on_devices(result: Result) -> str:
+    used, available = len(result.state.env_steps.sharding.device_set), jax.device_count()
+    return "" if len(result.seeds) == 1 or available == 1 else f", on {used} of {available} devices"

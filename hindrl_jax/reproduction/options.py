@@ -1,0 +1,209 @@
+"""Options of the recipe that can be switched: one change each, by name."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Literal
+
+from hindrl_jax.config import TrainConfig
+from hindrl_jax.tasks.registry import checked
+
+Group = Literal["baseline", "algorithm", "hindsight", "goals", "targets", "demonstrations", "critic", "actor", "inputs", "replay", "rollout"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Option:
+    """One change to the default recipe."""
+
+    name: str
+    """In kebab case; the name of its directory."""
+    group: Group
+    """What part of the recipe it is about."""
+    summary: str
+    """One line: what it changes, and the paper that it is from, if any."""
+    changes: tuple[tuple[str, Any], ...]
+    """Fields of `TrainConfig`, as in "steps" or "batch.n_step", and their new values. A value may be a function of the unchanged config."""
+
+
+def half_of_the_run(config: TrainConfig) -> int:
+    """Environment steps after which the run is half over."""
+    return config.steps // 2
+
+
+BASELINE = Option("default", "baseline", "the default recipe until its agent is reset", ())
+
+OPTIONS: tuple[Option, ...] = (
+    Option("sac", "algorithm", "SAC in place of TQC", (("agent.base", "sac"),)),
+    Option("td3", "algorithm", "TD3 in place of TQC, with its delayed actor", (("agent.base", "td3"),)),
+    Option("ddpg", "algorithm", "DDPG in place of TQC, as DDPGfD and the HinDRL paper have it", (("agent.base", "ddpg"), ("agent.num_critics", 1))),
+    Option(
+        "td3-preactivation",
+        "algorithm",
+        "as td3, with the mode before tanh kept small by a weight of 0.003 (HER)",
+        (("agent.base", "td3"), ("agent.preactivation_weight", 0.003)),
+    ),
+    Option(
+        "ddpg-preactivation",
+        "algorithm",
+        "as ddpg, with the mode before tanh kept small by a weight of 0.003 (HER)",
+        (("agent.base", "ddpg"), ("agent.num_critics", 1), ("agent.preactivation_weight", 0.003)),
+    ),
+    Option("goals-final", "hindsight", "relabelled with the rollout's last goal (HER)", (("batch.hindrl_sampling_strategy", "final"),)),
+    Option("goals-future", "hindsight", "relabelled with goals later in the rollout (HER)", (("batch.hindrl_sampling_strategy", "future"),)),
+    Option("goals-episode", "hindsight", "relabelled with any goal of the rollout (HER)", (("batch.hindrl_sampling_strategy", "episode"),)),
+    Option(
+        "goals-joint-union",
+        "hindsight",
+        "relabelled with goals of demonstrations and rollouts, half and half (HinDRL)",
+        (("batch.hindrl_sampling_strategy", "joint_union"), ("batch.union_sampling_ratio", 0.5)),
+    ),
+    Option("goals-random", "hindsight", "relabelled with any goal of any rollout (HER)", (("batch.hindrl_sampling_strategy", "random"),)),
+    Option(
+        "goals-intersection",
+        "hindsight",
+        "relabelled with goals of the rollout that lie near a demonstrated one (HinDRL)",
+        (("batch.hindrl_sampling_strategy", "joint_intersection"),),
+    ),
+    Option(
+        "goals-intersection-demo",
+        "hindsight",
+        "relabelled with demonstrated goals that the rollout came near (HinDRL)",
+        (("batch.hindrl_sampling_strategy", "joint_intersection"), ("batch.intersection_goals", "demonstrations")),
+    ),
+    Option("no-relabelling", "hindsight", "no relabelled rows (the thesis's TQCfD)", (("algo", "tqcfd"), ("batch.relabelled_per_original", 0.0))),
+    Option(
+        "relabelled-4", "hindsight", "four relabelled rows for each original one, in place of 1/4 (thesis)", (("batch.relabelled_per_original", 4.0),)
+    ),
+    Option(
+        "relabelled-go-on",
+        "hindsight",
+        "reaching a relabelled goal does not end the return (thesis)",
+        (("quirks.bootstrap_past_relabelled_goals", True),),
+    ),
+    Option("strict-goal-test", "goals", "a goal is reached at distance < epsilon, not <= (thesis)", (("quirks.strict_goal_test", True),)),
+    Option(
+        "task-goal", "goals", "rollouts aim at the task's constant goal, not at the end of a demonstration", (("goal.behavioural_goals", "task"),)
+    ),
+    Option(
+        "smooth",
+        "goals",
+        "demonstration goals filtered by epsilon (the thesis's Smooth HinDRL)",
+        (("algo", "smooth-hindrl"), ("goal.epsilon_filtering", True)),
+    ),
+    Option(
+        "achieved-goals",
+        "goals",
+        "as goals-joint-union, and half of the rollouts, falling to none, aim at states reached earlier (thesis, chapter 6)",
+        (("goal.achieved_goal_ratio", 0.5), ("goal.final_achieved_goal_ratio", 0.0), ("batch.hindrl_sampling_strategy", "joint_union")),
+    ),
+    Option("n-step-1", "targets", "1-step returns in place of 5 (thesis)", (("batch.n_step", 1),)),
+    Option("n-step-3", "targets", "3-step returns in place of 5", (("batch.n_step", 3),)),
+    Option("gamma-0.99", "targets", "discount 0.99 in place of 0.98 (thesis)", (("batch.gamma", 0.99),)),
+    Option("clip-targets", "targets", "targets clipped to [0, 1] (HER)", (("agent.clip_targets", True),)),
+    Option(
+        "bound-targets",
+        "targets",
+        "as clip-targets, and targets at least the return obtained (self-imitation learning)",
+        (("batch.bound_by_obtained_return", True), ("agent.clip_targets", True)),
+    ),
+    Option(
+        "timeouts-terminal",
+        "targets",
+        "episodes cut by the horizon count as terminated (original code)",
+        (("quirks.timeouts_are_terminal", True),),
+    ),
+    Option("demo-rows-none", "demonstrations", "no demonstration rows in the batch, so no cloning either", (("batch.max_demo_ratio", 0.0),)),
+    Option("demo-rows-half", "demonstrations", "half of the batch are demonstration rows, not a quarter (RLPD)", (("batch.max_demo_ratio", 0.5),)),
+    Option(
+        "demo-rows-fade",
+        "demonstrations",
+        "the share of demonstration rows falls to zero by the middle of the run (thesis)",
+        (("batch.reach_zero", half_of_the_run),),
+    ),
+    Option("bc-0", "demonstrations", "no cloning loss", (("agent.bc_weight", 0.0),)),
+    Option("bc-0.1", "demonstrations", "cloning loss with weight 0.1 in place of 0.01", (("agent.bc_weight", 0.1),)),
+    Option("bc-1", "demonstrations", "cloning loss with weight 1 in place of 0.01 (thesis)", (("agent.bc_weight", 1.0),)),
+    Option("bc-fades", "demonstrations", "the weight of the cloning loss falls to 0 along the run", (("agent.final_bc_weight", 0.0),)),
+    Option(
+        "q-filter",
+        "demonstrations",
+        "as bc-0.1, where the critics prefer the demonstrated action (Nair et al.)",
+        (("agent.q_filter", True), ("agent.bc_weight", 0.1)),
+    ),
+    Option("value-relative", "demonstrations", "value in the actor's loss over its own size, row by row", (("agent.relative_value", True),)),
+    Option("bc-warm-start", "demonstrations", "500 gradient steps of cloning before the first of reinforcement learning", (("bc_warm_start", 500),)),
+    Option("bc-norm", "demonstrations", "cloning loss is the distance, not its square (original code)", (("quirks.bc_loss", "norm"),)),
+    Option("bc-sample", "demonstrations", "cloning loss of a sampled action, not of the mean one (original code)", (("quirks.bc_action", "sample"),)),
+    Option(
+        "demo-resets-0.25",
+        "demonstrations",
+        "a quarter of all episodes begin in demonstrated states (Nair et al.)",
+        (("demo_reset_ratio", 0.25),),
+    ),
+    Option("demo-resets-0.5", "demonstrations", "half of all episodes begin in demonstrated states (Nair et al.)", (("demo_reset_ratio", 0.5),)),
+    Option(
+        "demo-resets-reverse",
+        "demonstrations",
+        "half of all episodes begin in demonstrated states, the last ones first (RFCL)",
+        (("demo_reset_ratio", 0.5), ("demo_reset_curriculum", 0.5)),
+    ),
+    Option("layer-norm", "critic", "layer normalisation in the critics (RLPD)", (("agent.layer_norm", True),)),
+    Option("critics-1", "critic", "1 critic in place of 2", (("agent.num_critics", 1),)),
+    Option("critics-5", "critic", "5 critics in place of 2 (TQC)", (("agent.num_critics", 5),)),
+    Option("redq", "critic", "5 critics, of which 2 at random make the targets (REDQ)", (("agent.num_critics", 5), ("agent.num_target_critics", 2))),
+    Option("no-truncation", "critic", "no quantiles dropped from the targets", (("agent.top_quantiles_to_drop_per_net", 0),)),
+    Option("target-rate-0.005", "critic", "target critics follow at 0.005 in place of 0.02 (TQC)", (("agent.target_update_rate", 0.005),)),
+    Option(
+        "preactivation",
+        "actor",
+        "the mode before tanh kept small by a weight of 0.003 on its squared length (HER)",
+        (("agent.preactivation_weight", 0.003),),
+    ),
+    Option("alpha-1", "actor", "the entropy coefficient starts at 1 in place of 0.002 (SAC)", (("agent.initial_alpha", 1.0),)),
+    Option("entropy-constant", "actor", "the target entropy stays at -1, it does not fall to -10", (("agent.final_target_entropy", None),)),
+    Option(
+        "no-actor-average",
+        "actor",
+        "the actor itself is evaluated, not its running average",
+        (("agent.actor_average_rate", 1.0), ("agent.actor_average_span", 0.0)),
+    ),
+    Option(
+        "actor-average-short", "actor", "the actor's average spans about 500 gradient steps, all along the run", (("agent.actor_average_span", 0.0),)
+    ),
+    Option("inputs-raw", "inputs", "networks see inputs as they are (thesis)", (("agent.input_encoding", "raw"),)),
+    Option("inputs-standardised", "inputs", "networks see standardised inputs", (("agent.input_encoding", "standardised"),)),
+    Option(
+        "prioritised",
+        "replay",
+        "rows drawn by their errors, those of demonstrations with a bonus, which leaves few of them (prioritised replay; DDPGfD)",
+        (("priority.priority_exponent", 0.6), ("priority.demo_priority_bonus", 1.0)),
+    ),
+    Option("batch-1024", "replay", "batches of 1,024 rows in place of 256", (("batch.batch_size", 1_024),)),
+    Option("random-truncation-0.02", "rollout", "training episodes are cut off after a step with probability 0.02", (("random_truncation", 0.02),)),
+    Option(
+        "environments-64",
+        "rollout",
+        "64 environments in place of 16: four times as many environment steps for each gradient step",
+        (("num_envs", 64), ("learning_starts", 6_400)),
+    ),
+    Option("updates-8", "rollout", "8 gradient steps per vectorised environment step in place of 2", (("updates_per_iteration", 8),)),
+)
+
+
+def apply(config: TrainConfig, option: Option) -> TrainConfig:
+    """The config with an option's changes, all made at once.
+
+    Raises:
+      UserError: if the changed config is refused.
+    """
+    sections: dict[str, dict[str, Any]] = {"": {}}
+    for field, value in option.changes:
+        section, _, name = field.rpartition(".")
+        sections.setdefault(section, {})[name] = value(config) if callable(value) else value
+    outermost = sections.pop("")
+
+    def changed() -> TrainConfig:
+        parts = {section: dataclasses.replace(getattr(config, section), **values) for section, values in sections.items()}
+        return dataclasses.replace(config, **outermost, **parts)
+
+    return checked(changed)

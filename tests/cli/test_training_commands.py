@@ -1,0 +1,164 @@
+"""`hindrl train`, `hindrl sweep`, and what reads a run back. In process; the one training run is tiny and shared by the tests that read it."""
+
+import csv
+import json
+
+import jax
+import numpy as np
+import pytest
+from commands import TINY, refusal
+
+from hindrl_jax import cli
+from hindrl_jax.cli.train_options import parse_train
+from hindrl_jax.runs.reader import load_run
+
+SEED_FIELDS = {"seed", "final_success", "best_success", "env_steps_to_95", "updates_to_95", "seconds_to_95", "episode_length"}
+TOTALS = {"updates_per_second", "env_steps_per_second", "compile_seconds", "train_seconds", "peak_memory_bytes"}
+
+
+def test_run_directory_holds_what_it_promises(run):
+    assert {file.name for file in run.iterdir()} == {
+        "config.json",
+        "metrics.csv",
+        "summary.json",
+        "parameters.npz",
+        "curve.png",
+        "episode.gif",
+    }
+    summary = json.loads((run / "summary.json").read_text())
+    assert set(summary) == TOTALS | {"seeds"}
+    assert [set(seed) for seed in summary["seeds"]] == [SEED_FIELDS] * 2
+    assert [seed["seed"] for seed in summary["seeds"]] == [5, 6]
+    assert all(seed["env_steps_to_95"] is None for seed in summary["seeds"])
+    rows = list(csv.DictReader((run / "metrics.csv").read_text().splitlines()))
+    # 200 random steps, then chunks of 4 steps (a tenth of eval_every, in steps of 2 environments): evaluations at 240 and 260 for 2 seeds
+    assert [(row["seed"], row["env_steps"], row["updates"]) for row in rows] == [
+        ("5", "240", "20"),
+        ("6", "240", "20"),
+        ("5", "260", "30"),
+        ("6", "260", "30"),
+    ]
+    assert all(np.isfinite(float(value)) for row in rows for value in row.values())
+    with np.load(run / "parameters.npz", allow_pickle=False) as archive:
+        assert archive["policy/params/Dense_0/kernel"].shape == (2, 40, 8)
+
+
+def test_config_runs_again_and_other_flags_change_it(run, tmp_path):
+    again = tmp_path / "again"
+    cli.main(["train", "--config", str(run), "--out", str(again)])
+    assert (again / "config.json").read_text() == (run / "config.json").read_text()
+    with np.load(run / "parameters.npz") as first, np.load(again / "parameters.npz") as second:
+        for name in first.files:
+            np.testing.assert_array_equal(first[name], second[name])
+    spec, _ = parse_train(["--config", str(run / "config.json"), "--learning-rate", "0.5", "--seeds", "1"])
+    assert (spec.config.agent.learning_rate, spec.seeds, spec.config.batch.batch_size) == (0.5, (5,), 16)
+
+
+def test_sweep_leaves_a_run_for_each_setting(tmp_path, capsys):
+    out = tmp_path / "sweep"
+    cli.main(
+        [
+            "sweep",
+            "--over",
+            "learning-rate=1e-3,2e-3",
+            "--over",
+            "bc_weight=0.1",
+            "--seeds",
+            "2",
+            "--seed",
+            "5",
+            "--tensorboard",
+            "--out",
+            str(out),
+            *TINY,
+        ]
+    )
+    printed = capsys.readouterr().out
+    assert "2 seeds from 5, 2 settings" in printed
+    folders = ["learning_rate=0.001,bc_weight=0.1", "learning_rate=0.002,bc_weight=0.1"]
+    assert sorted(file.name for file in out.iterdir()) == [*folders, "sweep.csv", "sweep.json", "sweep.png"]
+    rows = list(csv.DictReader((out / "sweep.csv").read_text().splitlines()))
+    assert [[row[name] for name in ("learning_rate", "bc_weight", "seeds", "seeds_reaching_95", "median_steps_to_95")] for row in rows] == [
+        ["0.001", "0.1", "2", "0", ""],
+        ["0.002", "0.1", "2", "0", ""],
+    ]
+    for folder, rate in zip(folders, (1e-3, 2e-3), strict=True):
+        run = load_run(out / folder)
+        assert (run.spec.seeds, run.spec.config.agent.learning_rate, run.spec.config.agent.bc_weight) == ((5, 6), rate, 0.1)
+        assert jax.tree.leaves(run.policies)[0].shape[0] == 2
+        metrics = list(csv.DictReader((out / folder / "metrics.csv").read_text().splitlines()))
+        assert [(row["seed"], row["env_steps"]) for row in metrics] == [("5", "240"), ("6", "240"), ("5", "260"), ("6", "260")]
+        for name in ("seed_5", "seed_6", "mean"):
+            (events,) = (out / folder / "tensorboard" / name).iterdir()
+            assert b"evaluation/success" in events.read_bytes()
+            assert b"final/success" in events.read_bytes()
+    first, second = (np.load(out / folder / "parameters.npz")["policy/params/Dense_0/kernel"] for folder in folders)
+    assert np.abs(first - second).max() > 0.0
+    assert "already holds sweep.json, sweep.csv" in refusal(capsys, "sweep", "--over", "gamma=0.9,0.8", "--out", out, *TINY)
+    assert "already holds config.json" in refusal(capsys, "sweep", "--over", "gamma=0.9,0.8", "--overwrite", "--out", out / folders[0], *TINY)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["sweep"], "--over is missing"),
+        (["sweep", "--over", "batch_size=1,2"], "'batch_size' cannot be swept"),
+        (["sweep", "--over", "gama=0.9"], "did you mean 'gamma'?"),
+        (["sweep", "--over", "gamma"], "write for example --over gamma=0.1,0.2"),
+        (["sweep", "--over", "gamma=0.9,x"], "write for example --over gamma=0.1,0.2"),
+        (["sweep", "--over", "gamma=0.9,0.9"], "a value is listed twice"),
+        (["sweep", "--over", "gamma=0.9,0.9000000001"], "a value is listed twice"),
+        (["sweep", "--over", "epsilon_deviations=1,2"], "would change nothing: epsilon depends on it only for epsilon_steps > 0"),
+        (["sweep", "--over", "union_sampling_ratio=0.1,0.2"], "would change nothing: only relabelling by joint_union"),
+        (["sweep", "--algo", "bc", "--over", "gamma=0.1,0.2"], "would change nothing: behaviour cloning does not use it"),
+        (["sweep", "--over", "gamma=0.9", "--over", "gamma=0.8"], "gamma is given twice"),
+        (["sweep", "--over", "gamma=0.9,1.5"], "gamma = 1.5 is not usable"),
+        (["train", "--host", "0"], "add --distributed"),
+        (["train", "--distributed", "--host", "0"], "belong together"),
+        (["train", "--distributed", "--coordinator", "first", "--num-hosts", "2", "--host", "0"], "write HOST:PORT"),
+        (["train", "--distributed", "--coordinator", "first:1", "--num-hosts", "2", "--host", "2"], "--host 2 is not one of --num-hosts 2"),
+    ],
+)
+def test_sweeps_and_hosts_that_make_no_sense_are_refused(arguments, message, tmp_path, capsys):
+    out = tmp_path / "run"
+    tiny = [] if "bc" in arguments else TINY
+    assert message in refusal(capsys, *arguments, "--out", out, *tiny)
+    assert not out.exists()
+
+
+def test_a_place_inside_a_file_is_refused(tmp_path, capsys):
+    file = tmp_path / "file"
+    file.write_text("mine")
+    assert "is a file" in refusal(capsys, "train", "--out", file / "run", *TINY)
+    assert file.read_text() == "mine"
+
+
+def test_eval_and_render_read_the_run_back(run, tmp_path, capsys):
+    cli.main(["eval", str(run), "--episodes", "4", "--stochastic"])
+    assert "4 episodes per seed" in capsys.readouterr().out
+    film = tmp_path / "film.gif"
+    cli.main(["render", str(run), "--to", str(film), "--seed", "6"])
+    assert film.read_bytes().startswith(b"GIF89a")
+    capsys.readouterr()
+    cli.main(["render", str(run), "--to", str(tmp_path / "film.mp4"), "--episodes", "2"])
+    assert "0 of 2 episodes are solved" in capsys.readouterr().out
+    assert (tmp_path / "film.mp4").read_bytes()[4:8] == b"ftyp"
+    assert "too few" in refusal(capsys, "render", run, "--episodes", 0)
+    assert "no seed 7" in refusal(capsys, "render", run, "--seed", 7, "--to", tmp_path / "other.gif")
+    assert not (tmp_path / "other.gif").exists()
+    assert "must end in .gif, .mp4 or .png" in refusal(capsys, "render", run, "--to", tmp_path / "film.avi")
+
+
+def test_files_that_are_not_ours_are_not_replaced(tmp_path, capsys):
+    (tmp_path / "summary.json").write_text("mine")
+    assert "summary.json" in refusal(capsys, "train", "--out", tmp_path, *TINY)
+    assert (tmp_path / "summary.json").read_text() == "mine"
+
+
+def test_existing_run_is_refused_and_kept(run, capsys):
+    before = {file.name: file.read_bytes() for file in run.iterdir()}
+    assert "already holds a run" in refusal(capsys, "train", "--out", run, *TINY)
+    # even with --overwrite, nothing is lost when the rest of the command is not usable
+    refusal(capsys, "train", "--out", run, "--overwrite", "--demos", "missing.hdf5", *TINY)
+    refusal(capsys, "train", "--out", run, "--overwrite", "--buffer-size", "100")
+    assert {file.name: file.read_bytes() for file in run.iterdir()} == before

@@ -1,0 +1,82 @@
+"""The options of the recipe: what each changes, and that it can be trained."""
+
+import dataclasses
+import re
+from typing import get_args
+
+import jax
+import pytest
+
+from hindrl_jax.base.errors import UserError
+from hindrl_jax.config import TrainConfig
+from hindrl_jax.core import train as training
+from hindrl_jax.core.guidance import guidance
+from hindrl_jax.reproduction.options import BASELINE, OPTIONS, Group, Option, apply, half_of_the_run
+from hindrl_jax.tasks.presets import preset
+from hindrl_jax.tasks.registry import make
+from hindrl_jax.training.prioritised import sampler_for
+from hindrl_jax.training.recording import record_demonstrations
+
+
+@pytest.mark.parametrize("option", OPTIONS, ids=lambda option: option.name)
+def test_every_option_changes_each_of_its_fields_and_nothing_else(option):
+    config = preset("hindrl", env="FixedGridPickAndPlace")
+    before, after = (dataclasses.asdict(each) for each in (config, apply(config, option)))
+    for part in ("batch", "goal", "agent", "priority", "quirks"):
+        before |= {f"{part}.{name}": value for name, value in before.pop(part).items()}
+        after |= {f"{part}.{name}": value for name, value in after.pop(part).items()}
+    changed = {name for name in before if before[name] != after[name]}
+    asked = {name for name, _ in option.changes}
+    # joint_union names its share, which is the default's, for the reader
+    assert changed
+    assert changed == asked - {"batch.union_sampling_ratio"}
+
+
+@pytest.fixture(scope="module")
+def demonstration():
+    env = make("FixedGridPickAndPlace")
+    return env, record_demonstrations(env, 1)
+
+
+@pytest.mark.parametrize("option", OPTIONS, ids=lambda option: option.name)
+def test_every_option_makes_a_program(option, demonstration):
+    """Traced, not compiled: what the config's own checks let pass, the training must not refuse."""
+    env, episodes = demonstration
+    config = apply(preset("hindrl", env=env), option)
+
+    def start_and_learn(key):
+        data, sampler = guidance(episodes, env, config), sampler_for(env, config)
+        state = training.init(key, data, env, config, sampler=sampler)
+        return training.learn(state, data, env=env, config=config, num_iterations=1, sampler=sampler)
+
+    state, metrics = jax.eval_shape(start_and_learn, jax.random.key(0))
+    assert (state.env_steps.shape, metrics["critic/loss"].shape) == ((), ())
+
+
+def test_options_have_names_for_directories_of_their_own():
+    names = [option.name for option in (BASELINE, *OPTIONS)]
+    assert len(set(names)) == len(names)
+    assert all(re.fullmatch(r"[a-z0-9]+([-.][a-z0-9]+)*", name) for name in names)
+    assert all(option.summary and "|" not in option.summary for option in OPTIONS)
+    assert all(option.group in get_args(Group) and option.group != BASELINE.group for option in OPTIONS)
+    order = [get_args(Group).index(option.group) for option in OPTIONS]
+    assert order == sorted(order)  # tables have a heading for each group
+
+
+def test_the_summaries_speak_of_the_recipe_as_it_is():
+    """They say "in place of 5" and the like by hand, so whoever changes the recipe must look at them."""
+    recipe = preset("hindrl")
+    batch, agent = recipe.batch, recipe.agent
+    assert (batch.n_step, batch.gamma, batch.max_demo_ratio, batch.relabelled_per_original, batch.batch_size) == (5, 0.98, 0.25, 0.25, 256)
+    assert (agent.num_critics, agent.target_update_rate, agent.bc_weight, agent.initial_alpha) == (2, 0.02, 0.01, 0.002)
+    assert (agent.target_entropy, agent.final_target_entropy, agent.actor_average_rate) == (-1.0, -10.0, 0.002)
+    assert (recipe.num_envs, recipe.updates_per_iteration) == (16, 2)
+
+
+def test_changes_are_made_at_once_and_may_depend_on_the_config():
+    config = TrainConfig(steps=1_000)
+    option = Option("both", "targets", "", (("algo", "tqcfd"), ("batch.relabelled_per_original", 0.0), ("batch.reach_zero", half_of_the_run)))
+    changed = apply(config, option)  # one after the other they would be refused
+    assert (changed.algo, changed.batch.relabelled_per_original, changed.batch.reach_zero) == ("tqcfd", 0.0, 500)
+    with pytest.raises(UserError, match="n_step = 0"):
+        apply(config, Option("bad", "targets", "", (("batch.n_step", 0),)))
