@@ -2,17 +2,18 @@
 
 import ast
 import dataclasses
+import inspect
 from pathlib import Path
 
 import pytest
 
 import hindrl_jax
-from hindrl_jax import config
-from hindrl_jax.config import AgentConfig, BatchConfig, GoalConfig, TrainConfig
+from hindrl_jax.config import AgentConfig, BatchConfig, GoalConfig, PriorityConfig, QuirksConfig, TrainConfig, conditions, without_effect
 
 SOURCES = [path for path in Path(hindrl_jax.__file__).parent.rglob("*.py") if path.parent.name != "config"]
-FIELDS = [(part, field.name) for part in (BatchConfig, GoalConfig, AgentConfig, TrainConfig) for field in dataclasses.fields(part)]
-# Derived in config.py itself and read elsewhere under another name.
+PARTS = (BatchConfig, GoalConfig, AgentConfig, PriorityConfig, QuirksConfig, TrainConfig)
+FIELDS = [(part, field.name) for part in PARTS for field in dataclasses.fields(part)]
+# Derived in the config itself and read elsewhere under another name.
 READ_THROUGH = {
     "max_demo_ratio": "max_demo_rows",
     "hindrl_sampling_strategy": "sources",
@@ -20,6 +21,7 @@ READ_THROUGH = {
     "strategy_mixture": "sources",
     "num_quantiles": "critic_outputs",
     "final_achieved_goal_ratio": "has_achieved_goals",
+    "algo": "learns_from_rollouts",
 }
 
 
@@ -37,10 +39,10 @@ def test_every_field_is_read_somewhere(config, name, attributes_read):
 
 @pytest.mark.parametrize(("config", "name"), FIELDS, ids=lambda value: getattr(value, "__name__", value))
 def test_every_field_has_a_line_of_documentation(config, name):
-    tree = ast.parse((Path(hindrl_jax.__file__).parent / "config" / "__init__.py").read_text())
+    tree = ast.parse(Path(inspect.getfile(config)).read_text())
     body = next(node.body for node in tree.body if isinstance(node, ast.ClassDef) and node.name == config.__name__)
     index = next(i for i, node in enumerate(body) if isinstance(node, ast.AnnAssign) and node.target.id == name)
-    if dataclasses.is_dataclass(getattr(config, name)):
+    if dataclasses.is_dataclass(getattr(config(), name)):
         return  # a nested config, documented by its own fields
     following = body[index + 1]
     assert isinstance(following, ast.Expr)
@@ -49,7 +51,7 @@ def test_every_field_has_a_line_of_documentation(config, name):
 
 def test_equal_configs_are_equal_and_hash_equal():
     def build():
-        return TrainConfig(batch=BatchConfig(gamma=0.9), agent=AgentConfig(net_arch=tuple([8, 8])), goal=GoalConfig(m=2, k=1.0))
+        return TrainConfig(batch=BatchConfig(gamma=0.9), agent=AgentConfig(net_arch=tuple([8, 8])), goal=GoalConfig(epsilon_steps=2, epsilon_deviations=1.0))
 
     assert build() == build()
     assert build() is not build()
@@ -71,26 +73,25 @@ BAD = [
     (BatchConfig, "union_sampling_ratio", [-0.1, 1.5]),
     (BatchConfig, "intersection_goals", ["both"]),
     (BatchConfig, "strategy_mixture", [(("future", 0.0),), (("joint_union", 1.0),), (("future", 1.0, 2.0),), (("future", 1.0),), "future"]),
-    (BatchConfig, "demo_returns", ["mc"]),
     (BatchConfig, "n_step", [0, None]),
     (BatchConfig, "gamma", [0.0, 1.01, float("inf")]),
-    (BatchConfig, "inclusive_goal_test", [1, "yes"]),
-    (BatchConfig, "terminate_on_relabel", [0]),
+    (QuirksConfig, "strict_goal_test", [1, "yes"]),
+    (QuirksConfig, "bootstrap_past_relabelled_goals", [0]),
     (BatchConfig, "bound_by_obtained_return", [1, "yes"]),
-    (BatchConfig, "timeouts_are_terminal", [None]),
-    (BatchConfig, "priority_exponent", [-0.1, 1.1, float("nan"), None]),
-    (BatchConfig, "importance_exponent", [-0.1, 1.1, None]),
-    (BatchConfig, "demo_priority_bonus", [-0.1, float("inf"), "1", 0.5]),  # 0.5 while transitions are drawn uniformly
-    (GoalConfig, "m", [-1, 0.5]),
-    (GoalConfig, "k", [-0.1, float("nan")]),
+    (QuirksConfig, "timeouts_are_terminal", [None]),
+    (PriorityConfig, "priority_exponent", [-0.1, 1.1, float("nan"), None]),
+    (PriorityConfig, "importance_exponent", [-0.1, 1.1, None]),
+    (PriorityConfig, "demo_priority_bonus", [-0.1, float("inf"), "1", 0.5]),  # 0.5 while transitions are drawn uniformly
+    (GoalConfig, "epsilon_steps", [-1, 0.5]),
+    (GoalConfig, "epsilon_deviations", [-0.1, float("nan")]),
     (GoalConfig, "epsilon", [-0.1, float("nan"), "0.1"]),
     (GoalConfig, "epsilon_filtering", [1]),
     (GoalConfig, "behavioural_goals", ["final"]),
     (GoalConfig, "achieved_goal_ratio", [-0.1, 1.1, None]),
     (GoalConfig, "final_achieved_goal_ratio", [-0.1, 1.1, "0"]),
-    (GoalConfig, "exclude_last_goal", [0]),
-    (GoalConfig, "rescale_demo_actions", ["true"]),
-    (GoalConfig, "misalign_demo_actions", [1.0]),
+    (QuirksConfig, "exclude_last_goal", [0]),
+    (QuirksConfig, "unscaled_demo_actions", ["true"]),
+    (QuirksConfig, "misaligned_demo_actions", [1.0]),
     (AgentConfig, "net_arch", [(), (8, 0), [8, 8], (8.0,), 8]),
     (AgentConfig, "layer_norm", [1]),
     (AgentConfig, "network_precision", ["float16", 32]),
@@ -99,12 +100,9 @@ BAD = [
     (AgentConfig, "base", ["ppo", None]),
     (AgentConfig, "num_critics", [0]),
     (AgentConfig, "num_target_critics", [0, 3]),
-    (AgentConfig, "actor_delay", [0]),
-    (AgentConfig, "max_gradient_norm", [0.0, "1"]),
     (AgentConfig, "exploration_noise", [-0.1]),
     (AgentConfig, "target_noise", [-0.1]),
     (AgentConfig, "target_noise_clip", [-0.1]),
-    (AgentConfig, "normalise_value", [1]),
     (AgentConfig, "relative_value", [1]),
     (AgentConfig, "preactivation_weight", [-0.1, None]),
     (AgentConfig, "final_bc_weight", [-1.0, float("nan")]),
@@ -119,10 +117,10 @@ BAD = [
     (AgentConfig, "target_entropy", [float("nan"), "auto"]),
     (AgentConfig, "final_target_entropy", [float("nan")]),
     (AgentConfig, "bc_weight", [-1.0]),
-    (AgentConfig, "bc_loss", ["l2"]),
-    (AgentConfig, "bc_action", ["mode"]),
+    (QuirksConfig, "bc_loss", ["l2"]),
+    (QuirksConfig, "bc_action", ["mode"]),
     (AgentConfig, "input_encoding", ["scaled", "standardized"]),
-    (AgentConfig, "policy_input", ["observation"]),
+    (QuirksConfig, "achieved_goal_input", ["yes"]),
     (TrainConfig, "algo", ["HinDRL", "sac"]),
     (TrainConfig, "steps", [0, 1e5]),
     (TrainConfig, "num_envs", [0]),
@@ -133,13 +131,14 @@ BAD = [
     (TrainConfig, "agent_resets", [(0.0,), (1.0,), (0.5, 0.5), (0.6, 0.3), (0.5, "1"), 0.5, None]),
     (TrainConfig, "demo_reset_curriculum", [-0.1, 1.1, 0.5]),  # 0.5 without resets to demonstrated states
     (TrainConfig, "bc_warm_start", [-1, 0.5]),
-    (TrainConfig, "pretrain_updates", [-1, 0.5]),
     (TrainConfig, "buffer_size", [0, 1e6]),
     (TrainConfig, "eval_every", [0]),
     (TrainConfig, "eval_episodes", [0]),
     (TrainConfig, "batch", [None, {}, AgentConfig()]),
     (TrainConfig, "goal", [None]),
     (TrainConfig, "agent", [None]),
+    (TrainConfig, "priority", [None]),
+    (TrainConfig, "quirks", [None]),
 ]
 
 
@@ -151,13 +150,13 @@ def test_bad_values_are_named(config, name, value):
 
 def test_the_share_of_demonstrations_follows_from_priorities_or_from_the_steps():
     with pytest.raises(ValueError, match=r"reach_zero = 10 is of no use with priority_exponent = 0\.6.*set one of them to None or 0"):
-        BatchConfig(reach_zero=10, priority_exponent=0.6)
+        TrainConfig(batch=BatchConfig(reach_zero=10), priority=PriorityConfig(priority_exponent=0.6))
 
 
 def test_epsilon_is_given_or_found_but_not_both():
     GoalConfig(epsilon=0.1)
-    with pytest.raises(ValueError, match="m = 5 is of no use"):
-        GoalConfig(epsilon=0.1, m=5)
+    with pytest.raises(ValueError, match="epsilon_steps = 5 is of no use"):
+        GoalConfig(epsilon=0.1, epsilon_steps=5)
 
 
 def test_the_table_of_bad_values_is_complete():
@@ -171,7 +170,7 @@ def test_the_table_of_bad_values_is_complete():
         lambda: AgentConfig(num_quantiles=25, top_quantiles_to_drop_per_net=24, target_entropy=-3.0, bc_weight=0, net_arch=(1,)),
         lambda: TrainConfig(algo="bc", steps=1, learning_starts=5),  # cloning takes no environment steps
         lambda: TrainConfig(demo_reset_ratio=1),
-        lambda: BatchConfig(priority_exponent=1, importance_exponent=0, demo_priority_bonus=100),
+        lambda: PriorityConfig(priority_exponent=1, importance_exponent=0, demo_priority_bonus=100),
     ],
 )
 def test_values_at_the_edge_are_accepted(build):
@@ -199,10 +198,9 @@ def test_the_algorithm_must_fit_its_settings(fitting, contradiction, name):
     "changes",
     [
         dict(bc_warm_start=1),
-        dict(pretrain_updates=1),
         dict(agent=AgentConfig(q_filter=True)),
         dict(agent=AgentConfig(base="sac")),
-        dict(batch=BatchConfig(priority_exponent=0.5)),
+        dict(priority=PriorityConfig(priority_exponent=0.5)),
     ],
 )
 def test_cloning_alone_refuses_what_it_would_ignore(changes):
@@ -221,8 +219,8 @@ def test_number_of_demonstration_rows(size, ratio, rows):
 
 
 def test_conditions_are_about_fields_that_exist():
-    known = {field.name for part in (TrainConfig, BatchConfig, GoalConfig, AgentConfig) for field in dataclasses.fields(part)}
-    assert {name for names, _, _ in config._CONDITIONS for name in names.split()} <= known
+    known = {field.name for part in PARTS for field in dataclasses.fields(part)}
+    assert {name for names, _, _ in conditions._CONDITIONS for name in names.split()} <= known
 
 
 @pytest.mark.parametrize(
@@ -237,7 +235,7 @@ def test_conditions_are_about_fields_that_exist():
         ({"batch": {"hindrl_sampling_strategy": "joint_union"}}, "union_sampling_ratio", None),
         ({"batch": {"relabelled_per_original": 0.0}}, "hindrl_sampling_strategy", "nothing is relabelled"),
         ({"batch": {"max_demo_ratio": 0.0}}, "bc_loss", "no demonstration rows to clone"),
-        ({"batch": {"max_demo_ratio": 0.0, "priority_exponent": 0.5}}, "bc_loss", None),
+        ({"batch": {"max_demo_ratio": 0.0}, "priority": {"priority_exponent": 0.5}}, "bc_loss", None),
         ({"agent": {"bc_weight": 0.0}}, "bc_action", "nothing is cloned"),
         ({}, "learning_rate", None),
         ({"algo": "bc"}, "learning_rate", None),
@@ -246,5 +244,5 @@ def test_conditions_are_about_fields_that_exist():
 )
 def test_fields_without_effect_are_known(changes, name, reason):
     parts = {part: dataclasses.replace(getattr(TrainConfig(), part), **values) for part, values in changes.items() if part != "algo"}
-    said = config.without_effect(TrainConfig(**parts, **{key: value for key, value in changes.items() if key == "algo"}), name)
+    said = without_effect(TrainConfig(**parts, **{key: value for key, value in changes.items() if key == "algo"}), name)
     assert said is None if reason is None else reason in said
