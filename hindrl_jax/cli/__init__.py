@@ -16,7 +16,7 @@ import jax
 
 from hindrl_jax import __version__
 from hindrl_jax.base.errors import UserError, one_line
-from hindrl_jax.cli import comparison, demonstrations, environments, playing, reproduction, sweeping, training
+from hindrl_jax.cli import comparison, demonstrations, environments, inspection, playing, reproduction, sweeping, training
 from hindrl_jax.cli.signals import interrupts_that_last
 from hindrl_jax.tasks.registry import did_you_mean
 
@@ -29,8 +29,8 @@ COMMANDS: dict[str, Command | dict[str, Command]] = {
     "compare": comparison.compare,
     "demos": {
         "record": demonstrations.record,
-        "info": demonstrations.info,
-        "plot": demonstrations.plot,
+        "info": inspection.info,
+        "plot": inspection.plot,
         "render": demonstrations.render,
         "convert": demonstrations.convert,
     },

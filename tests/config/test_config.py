@@ -51,7 +51,9 @@ def test_every_field_has_a_line_of_documentation(config, name):
 
 def test_equal_configs_are_equal_and_hash_equal():
     def build():
-        return TrainConfig(batch=BatchConfig(gamma=0.9), agent=AgentConfig(net_arch=tuple([8, 8])), goal=GoalConfig(epsilon_steps=2, epsilon_deviations=1.0))
+        return TrainConfig(
+            batch=BatchConfig(gamma=0.9), agent=AgentConfig(net_arch=tuple([8, 8])), goal=GoalConfig(epsilon_steps=2, epsilon_deviations=1.0)
+        )
 
     assert build() == build()
     assert build() is not build()
