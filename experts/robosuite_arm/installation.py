@@ -21,7 +21,7 @@ from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.envs import panda
 
 ROBOSUITE_VERSION, MUJOCO_SERIES = "1.5.1", "3.9"  # from MuJoCo 3.10 on, this robosuite fails to build any environment
-INSTALL = f"{sys.executable} -m pip install robosuite=={ROBOSUITE_VERSION} 'mujoco=={MUJOCO_SERIES}.*'"
+INSTALL = f"{sys.executable} -m pip install robosuite=={ROBOSUITE_VERSION} 'mujoco=={MUJOCO_SERIES}.*' 'mujoco-mjx=={MUJOCO_SERIES}.*'"
 
 
 @contextlib.contextmanager

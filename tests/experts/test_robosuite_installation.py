@@ -27,11 +27,11 @@ def installed(**versions):
 @pytest.mark.parametrize(
     ("versions", "message"),
     [
-        (dict(mujoco="3.9.0"), r"needs robosuite, which is not installed: .*-m pip install robosuite==1.5.1 'mujoco==3.9.\*'$"),
+        (dict(mujoco="3.9.0"), r"needs robosuite, which is not installed: .*-m pip install robosuite==1.5.1 'mujoco==3.9.\*' 'mujoco-mjx==3.9.\*'$"),
         (dict(mujoco="3.10.0", robosuite="1.5.1"), r"needs robosuite 1.5.1 with mujoco 3.9, but robosuite 1.5.1 and mujoco 3.10.0 are installed"),
         (
             dict(mujoco="3.9.0", robosuite="1.5.2"),
-            r"but robosuite 1.5.2 and mujoco 3.9.0 are installed: .*-m pip install robosuite==1.5.1 'mujoco==3.9.\*'$",
+            r"but robosuite 1.5.2 and mujoco 3.9.0 are installed: .*-m pip install robosuite==1.5.1 'mujoco==3.9.\*' 'mujoco-mjx==3.9.\*'$",
         ),
         (dict(mujoco="3.90.0", robosuite="1.5.1"), r"mujoco 3.90.0"),
     ],
