@@ -66,7 +66,7 @@ def test_every_module_has_a_page():
     listed = {name for path in PAGES for name in re.findall(r"^::: (\S+)$", path.read_text(), re.M)}
     files = [ROOT.joinpath(path) for path in glob.glob("hindrl_jax/**/*.py", root_dir=ROOT, recursive=True)]  # unlike rglob, follows links
     modules = {".".join(path.relative_to(ROOT).with_suffix("").parts) for path in files}
-    modules = {name for name in modules if not name.endswith(("__init__", "__main__")) and not name.startswith("hindrl_jax.cli.")}
+    modules = {name for name in modules if not name.rpartition(".")[2].startswith("_") and not name.startswith("hindrl_jax.cli.")}
     assert listed == modules
 
 
