@@ -118,7 +118,7 @@ def bar(result: Result, began: tuple[int, float] | None, *, width: int, unicode:
       unicode: draw with more than ASCII.
     """
     done, total = min(result.steps_done, result.config.steps), result.config.steps
-    unit = "updates" if result.config.algo == "bc" else "steps"
+    unit = "steps" if result.config.learns_from_rollouts else "updates"
     words = f" {done:,}/{total:,} {unit}"
     success = result.latest_success()
     if success is not None:

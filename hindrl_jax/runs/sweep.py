@@ -82,7 +82,7 @@ class SweepWriter:
         guidance, agent = jax.device_get((result.guidance, result.state.agent))  # once, not for each part
         result = dataclasses.replace(result, guidance=guidance, state=result.state.replace(agent=agent))
         parts = [result.part(slice(index * num_seeds, (index + 1) * num_seeds)) for index in range(len(self.runs))]
-        unit = "updates" if result.config.algo == "bc" else "env_steps"
+        unit = "env_steps" if result.config.learns_from_rollouts else "updates"
         table = []
         for setting, writer, part in zip(self.settings, self.runs, parts, strict=True):
             seeds = writer.finish(part, film=False)["seeds"]
