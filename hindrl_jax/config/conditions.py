@@ -1,4 +1,4 @@
-"""Which fields have an effect only under a condition."""
+"""Which fields have an effect only under a condition. `tests/config/test_conditions.py` holds the table to what is computed."""
 
 from __future__ import annotations
 
@@ -8,15 +8,27 @@ from hindrl_jax.config.train import TrainConfig
 
 
 def _relabels(config: TrainConfig) -> bool:
-    return config.algo not in ("bc", "tqcfd") and config.batch.relabelled_per_original > 0
+    return config.learns_from_rollouts and config.batch.relabelled_per_original > 0
+
+
+def _tests_goals(config: TrainConfig) -> bool:
+    return _relabels(config) or (config.learns_from_rollouts and config.goal.has_achieved_goals)
+
+
+def _relabels_with_demonstrations(config: TrainConfig) -> bool:
+    return _relabels(config) and not {"task_conditioned", "joint_intersection"}.isdisjoint(dict(config.batch.sources))
 
 
 def _has_demo_rows(config: TrainConfig) -> bool:
-    return config.algo == "bc" or config.batch.max_demo_rows > 0 or config.priority.is_used
+    return not config.learns_from_rollouts or config.batch.max_demo_rows > 0 or config.priority.is_used
 
 
-# Which fields have an effect only under a condition: the fields, the condition, and what to do where it does not hold.
-_CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
+def _clones(config: TrainConfig) -> bool:
+    """Whether cloning is ever part of the loss; a `bc_warm_start` clones by itself."""
+    return not config.learns_from_rollouts or config.agent.bc_weight > 0.0 or bool(config.agent.final_bc_weight)
+
+
+CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
     (
         "max_demo_ratio reach_zero relabelled_per_original hindrl_sampling_strategy union_sampling_ratio intersection_goals strategy_mixture "
         "n_step gamma bootstrap_past_relabelled_goals bound_by_obtained_return timeouts_are_terminal importance_exponent demo_priority_bonus "
@@ -24,7 +36,7 @@ _CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
         "layer_norm target_update_rate initial_alpha target_entropy final_target_entropy exploration_noise target_noise "
         "target_noise_clip relative_value preactivation_weight bc_weight final_bc_weight agent_resets num_envs "
         "updates_per_iteration learning_starts buffer_size demo_reset_ratio demo_reset_curriculum random_truncation",
-        lambda config: config.learns_from_rollouts,
+        lambda c: c.learns_from_rollouts,
         "behaviour cloning does not use it: choose another algo",
     ),
     (
@@ -36,9 +48,14 @@ _CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
     ("exploration_noise", lambda c: not c.agent.has_entropy, "{base} samples its actions: choose --base td3 or ddpg"),
     ("target_noise target_noise_clip", lambda c: c.agent.base == "td3", "{base} has no such noise: choose --base td3"),
     (
-        "hindrl_sampling_strategy union_sampling_ratio intersection_goals strategy_mixture bootstrap_past_relabelled_goals",
+        "hindrl_sampling_strategy union_sampling_ratio intersection_goals strategy_mixture",
         _relabels,
         "nothing is relabelled: choose --algo hindrl with --relabelled-per-original above 0",
+    ),
+    (
+        "bootstrap_past_relabelled_goals strict_goal_test",
+        _tests_goals,
+        "no goal is tested: choose --algo hindrl with --relabelled-per-original above 0, or an --achieved-goal-ratio",
     ),
     (
         "union_sampling_ratio",
@@ -50,26 +67,39 @@ _CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
         lambda c: c.batch.uses_intersections,
         "only relabelling by joint_intersection uses it: choose --hindrl-sampling-strategy joint_intersection",
     ),
+    (
+        "epsilon_filtering exclude_last_goal",
+        _relabels_with_demonstrations,
+        "nothing is relabelled with goals of demonstrations: choose --algo hindrl with --hindrl-sampling-strategy task_conditioned",
+    ),
     ("importance_exponent demo_priority_bonus", lambda c: c.priority.is_used, "transitions have no priorities: raise --priority-exponent"),
+    ("max_demo_ratio", lambda c: not c.priority.is_used, "the share of demonstrations follows from their priorities: set --priority-exponent 0"),
     ("reach_zero", lambda c: c.batch.max_demo_rows > 0, "the batch has no demonstration rows: raise --max-demo-ratio"),
     (
-        "bc_weight final_bc_weight bc_loss bc_action q_filter",
+        "bc_weight final_bc_weight q_filter",
         _has_demo_rows,
         "the batch has no demonstration rows to clone: raise --max-demo-ratio",
     ),
-    ("q_filter bc_loss bc_action", lambda c: c.algo == "bc" or c.agent.bc_weight > 0.0, "nothing is cloned: raise --bc-weight"),
+    (
+        "bc_loss bc_action unscaled_demo_actions",
+        lambda c: _has_demo_rows(c) or c.bc_warm_start > 0,
+        "the batch has no demonstration rows to clone: raise --max-demo-ratio",
+    ),
+    ("q_filter", _clones, "nothing is cloned: raise --bc-weight"),
+    ("bc_loss bc_action", lambda c: _clones(c) or c.bc_warm_start > 0, "nothing is cloned: raise --bc-weight"),
     ("epsilon_deviations", lambda c: c.goal.epsilon_steps > 0, "epsilon depends on it only for epsilon_steps > 0: add --epsilon-steps 5"),
     (
         "epsilon_steps epsilon_deviations epsilon",
-        lambda c: _relabels(c) or c.goal.epsilon_filtering or c.goal.has_achieved_goals,
+        _tests_goals,
         "epsilon is used only for relabelling, achieved goals and the filter: choose --algo hindrl",
     ),
 )
+"""The fields, the condition under which they have an effect, and what to do where it does not hold."""
 
 
 def without_effect(config: TrainConfig, name: str) -> str | None:
     """Why changing a field would change nothing in this config, and what to do; None if it has an effect, as far as is known."""
-    for names, has_effect, reason in _CONDITIONS:
+    for names, has_effect, reason in CONDITIONS:
         if name in names.split() and not has_effect(config):
             return reason.format(base=config.agent.base)
     return None

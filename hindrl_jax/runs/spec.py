@@ -73,7 +73,7 @@ class RunSpec:
             raise UserError(f"{where}: seeds = {seeds!r} is not usable: it must be a list of whole numbers from 0 to {2**32 - 1}")
         return RunSpec(
             env=make(str(data["env"]), **env_args),
-            config=_config_from_dict(TrainConfig, data["config"], where),
+            config=_config_from_dict(TrainConfig, data["config"], "config", where),
             demos=str(data["demos"]),
             seeds=tuple(seeds),
         )
@@ -95,17 +95,17 @@ def read_spec(path: Path) -> RunSpec:
     return RunSpec.from_json(data, path)
 
 
-def _config_from_dict(config_class: type[Any], data: Any, where: Path) -> Any:
+def _config_from_dict(config_class: type[Any], data: Any, name: str, where: Path) -> Any:
     if not isinstance(data, dict):
-        raise UserError(f"{where}: {config_class.__name__} is {data!r}, not an object of fields")
+        raise UserError(f"{where}: {name} = {data!r} is not usable: it must be an object of fields")
     hints = get_type_hints(config_class)
     _refuse_unknown(data, hints, where)
     values = {}
-    for name, value in data.items():
-        if dataclasses.is_dataclass(hints[name]):
-            values[name] = _config_from_dict(hints[name], value, where)
+    for field, value in data.items():
+        if dataclasses.is_dataclass(hints[field]):
+            values[field] = _config_from_dict(hints[field], value, field, where)
         else:
-            values[name] = _tuples(value) if get_args(hints[name]) else value
+            values[field] = _tuples(value) if get_args(hints[field]) else value
     try:
         return config_class(**values)
     except ValueError as error:

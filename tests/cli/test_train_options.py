@@ -92,6 +92,9 @@ def test_configuration_files_are_checked_field_by_field(tmp_path, capsys):
 
     assert "did you mean 'num_envs'" in says(good | {"config": good["config"] | {"num_envz": 3}})
     assert "steps = 'many'" in says(good | {"config": good["config"] | {"steps": "many"}})
+    assert "batch = 3 is not usable" in says(good | {"config": good["config"] | {"batch": 3}})
+    assert "gamma = True" in says(good | {"config": good["config"] | {"batch": good["config"]["batch"] | {"gamma": True}}})
+    assert "gamma = nan" in says(good | {"config": good["config"] | {"batch": good["config"]["batch"] | {"gamma": float("nan")}}})
     assert "did you mean 'num_objects'" in says(good | {"env_args": {"num_object": 3}})
     assert "lacks 'seeds'" in says({name: value for name, value in good.items() if name != "seeds"})
     assert "seeds = [-1]" in says(good | {"seeds": [-1]})
