@@ -3,7 +3,8 @@
 python -m benchmarks.gpu                    # prints Markdown and writes gpu.json; on a CPU, too, where fewer cases fit into the time
 python -m benchmarks.gpu --quick            # does it still work? Writes gpu-quick.json, whose figures mean nothing
 
-Each part has to end by a certain time after the start. A case that does not fit in any more, or not into the memory, is named and left out.
+Each part has to end by a certain time after the start, and the script ends within ten minutes whatever it does. A case that does not fit in any
+more, or not into the memory, is named and left out.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import dataclasses
 import functools
 import json
 import os
+import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -204,54 +206,48 @@ def hours_of_the_thesis(gradient_rows: Sequence[Row]) -> list[Row]:
     return rows
 
 
-def tables(results: dict[str, list[Row]]) -> str:
-    """Everything as Markdown."""
-    solved = results["solving"][0]
-    hours = results["hours_of_the_thesis"]
-    seconds = ["-" if solved[name] is None else f"{solved[name]:.0f} s" for name in ("compile_seconds", "seconds_to_half", "seconds_to_all")]
+def tables(results: dict[str, Any]) -> str:
+    """What there is of the parts, as Markdown."""
     table, milliseconds = report.table, functools.partial(timing.milliseconds, clock="wall")
-    return "\n".join(
-        [
-            "Gradient steps, `train.learn`: the whole loop\n",
-            table(
-                ["setting", "seeds", "ms per step of all seeds", "ms per step and seed", "gradient steps per second, all seeds"],
-                [
-                    [f"`{row['setting']}`", row["num_seeds"], milliseconds(row), row["ms_per_seed"], f"{1000.0 / row['ms_per_seed']:,.0f}"]
-                    for row in results["gradient_steps"]
-                ],
-            ),
-            "\n".join(f"- `{name}`: {setting.description}" for name, setting in SETTINGS.items()) + "\n",
-            f"Hours of the thesis, {SEEDS_OF_THESIS} seeds side by side; as much again for the original code's quirks\n",
-            table(
-                ["experiment", "trainings", "steps of each", "hours"],
-                [[row["experiment"], row["cells"] * SEEDS_OF_THESIS, f"{row['steps']:,}", f"{row['hours']:.2g}"] for row in hours]
-                + [["all", sum(row["cells"] for row in hours) * SEEDS_OF_THESIS, "", f"{sum(row['hours'] for row in hours):.2g}"]],
-            ),
-            f"FixedGridPickAndPlace, one demonstration, default recipe, {solved['num_seeds']} seeds side by side\n",
-            table(
-                ["compilation", "half of the seeds have reached 95%", "all have", "seeds that have", "environment steps each"],
-                [[*seconds, solved["seeds_solved"], solved["env_steps"]]],
-            ),
-            "Environment steps per second\n",
-            table(
-                ["environment", "side by side", "steps per second"],
-                [[f"`{row['env']}`", f"{row['num_envs']:,}", f"{row['steps_per_second']:,}"] for row in results["environment_steps"]],
-            ),
-            "Forms of the kernels\n",
-            table(
-                ["kernel", "form", "batch", "ms"], [[row["kernel"], row["form"], f"{row['batch']:,}", milliseconds(row)] for row in results["forms"]]
-            ),
+    text = ""
+    if "gradient_steps" in results:
+        gradient = [
+            [f"`{row['setting']}`", row["num_seeds"], milliseconds(row), row["ms_per_seed"], f"{1000.0 / row['ms_per_seed']:,.0f}"]
+            for row in results["gradient_steps"]
         ]
-    )
+        header = ["setting", "seeds", "ms per step of all seeds", "ms per step and seed", "gradient steps per second, all seeds"]
+        text += f"Gradient steps, `train.learn`: the whole loop\n\n{table(header, gradient)}\n"
+        text += "\n".join(f"- `{name}`: {setting.description}" for name, setting in SETTINGS.items())
+        hours = hours_of_the_thesis(results["gradient_steps"])
+        lines = [[row["experiment"], row["cells"] * SEEDS_OF_THESIS, f"{row['steps']:,}", f"{row['hours']:.2g}"] for row in hours]
+        lines.append(["all", sum(row["cells"] for row in hours) * SEEDS_OF_THESIS, "", f"{sum(row['hours'] for row in hours):.2g}"])
+        text += f"\n\nHours of the thesis, {SEEDS_OF_THESIS} seeds side by side; as much again for the original code's quirks\n\n"
+        text += table(["experiment", "trainings", "steps of each", "hours"], lines)
+    if "solving" in results:
+        row = results["solving"][0]
+        seconds = ["-" if row[name] is None else f"{row[name]:.0f} s" for name in ("compile_seconds", "seconds_to_half", "seconds_to_all")]
+        header = ["compilation", "half of the seeds have reached 95%", "all have", "seeds that have", "environment steps each"]
+        text += f"\nFixedGridPickAndPlace, one demonstration, default recipe, {row['num_seeds']} seeds side by side\n\n"
+        text += table(header, [[*seconds, row["seeds_solved"], row["env_steps"]]])
+    if "environment_steps" in results:
+        lines = [[f"`{row['env']}`", f"{row['num_envs']:,}", f"{row['steps_per_second']:,}"] for row in results["environment_steps"]]
+        text += f"\nEnvironment steps per second\n\n{table(['environment', 'side by side', 'steps per second'], lines)}"
+    if "forms" in results:
+        lines = [[row["kernel"], row["form"], f"{row['batch']:,}", milliseconds(row)] for row in results["forms"]]
+        text += f"\nForms of the kernels\n\n{table(['kernel', 'form', 'batch', 'ms'], lines)}"
+    return text
 
 
 PARTS: dict[str, tuple[Callable[[Task], list[Row]], float]] = {
     "forms": (forms, 60.0),
     "environment_steps": (environment_steps, 130.0),
-    "solving": (solving, 320.0),
-    "gradient_steps": (gradient_steps, 560.0),
+    "gradient_steps": (gradient_steps, 400.0),
+    "solving": (solving, 570.0),
 }
 """Each part, and by how many seconds after the start it has to be over."""
+
+LIMIT = 590.0
+"""Seconds after which the script ends whatever it does, since a compilation cannot be broken off."""
 
 
 def main() -> None:
@@ -266,14 +262,24 @@ def main() -> None:
     head = f"{time.strftime('%Y-%m-%d')}, {report.machine()}; {', '.join(f'{name} {version}' for name, version in report.versions().items())}"
     print(f"{head}\n", flush=True)
     results: dict[str, Any] = {"measured": head, "quick": given.quick}
+
+    def finish() -> None:
+        path.write_text(json.dumps(results | {"seconds": round(time.perf_counter() - began)}, indent=1))
+        print(f"\n{tables(results)}\nwrote {path}", flush=True)
+
+    def give_up() -> None:
+        print(f"stopped after {LIMIT:.0f} s", flush=True)
+        finish()
+        os._exit(0)
+
+    watchdog = threading.Timer(LIMIT, give_up)
+    watchdog.daemon = True
+    watchdog.start()
     for name, (part, ends) in PARTS.items():
         results[name] = part(Task(quick=given.quick, ends=began + ends))
-        path.write_text(json.dumps(results, indent=1))  # after each part, so that a later failure loses nothing
         print(f"{name}: {time.perf_counter() - began:.0f} s after the start", flush=True)
-    results["hours_of_the_thesis"] = hours_of_the_thesis(results["gradient_steps"])
-    results["seconds"] = round(time.perf_counter() - began)
-    path.write_text(json.dumps(results, indent=1))
-    print(f"\n{tables(results)}\nwrote {path}")
+    watchdog.cancel()
+    finish()
 
 
 if __name__ == "__main__":
