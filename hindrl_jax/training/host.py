@@ -168,6 +168,7 @@ class HostPrograms(Programs):
         if begun.desired_goal is None:
             key_goals = jax.vmap(functools.partial(jax.random.fold_in, data=6))(state.key)
             begun = jax.vmap(with_goals)(key_goals, begun, guidance)
+        begun = begun.replace(notes=jax.tree.map(jnp.zeros_like, state.rollout.notes))
         return self._put(state.replace(replay=state.replay.replace(step=jnp.zeros_like(state.replay.step)), rollout=begun))
 
     def _by_seed(self, arrays: Any) -> Any:
