@@ -10,9 +10,9 @@ TORCH = torch torchvision
 PYTHONS = $(foreach minor,14 13 12,python3.$(minor) $(wildcard $(HOME)/.pyenv/versions/3.$(minor).*/bin/python)) $(PYTHON)
 NEWEST_PYTHON ?= $(shell for python in $(PYTHONS); do if $$python -c "" 2>/dev/null; then echo $$python; break; fi; done)
 NEWEST_PIP = $(subst .venv,.venv-newest,$(PIP)) --upgrade --upgrade-strategy eager
-# The extra `test` without what pins MuJoCo, and without what looks at text only.
-NEWEST_EXTRAS = .[gymnasium-robotics,minari,tensorboard,video]
-NEWEST_TOOLS = pytest pytest-xdist hypothesis
+# The extra `test` without what keeps MuJoCo back, robosuite and gymnasium-robotics, and without what looks at text only.
+NEWEST_EXTRAS = .[minari,tensorboard,video]
+NEWEST_TOOLS = pytest pytest-xdist hypothesis ipython
 
 .PHONY: train test test-newest test-versions test-slow test-interop coverage lint docs package bench clean
 

@@ -93,7 +93,8 @@ def write_recording(path: str | os.PathLike[str], recording: Recording, *, env: 
         written = read_all(path, file)
     if env is not None:
         check_against_env(path, written, env)
-    write_atomically(path, content.getbuffer(), overwrite=overwrite)
+    with content.getbuffer() as whole:  # given back also where writing fails: else the buffer's end complains of it
+        write_atomically(path, whole, overwrite=overwrite)
 
 
 def check_recording(recording: Recording, where: str | os.PathLike[str]) -> None:

@@ -137,7 +137,8 @@ class Checkpoints:
         fields = {field.name: getattr(stacked, field.name) for field in dataclasses.fields(Episodes)}
         content = io.BytesIO()
         np.savez(content, **{name: array for name, array in fields.items() if array is not None})
-        write_atomically(self.folder / DEMONSTRATIONS, content.getbuffer(), overwrite=True)
+        with content.getbuffer() as whole:
+            write_atomically(self.folder / DEMONSTRATIONS, whole, overwrite=True)
 
     @property
     def has_demonstrations(self) -> bool:
