@@ -1,7 +1,7 @@
 """What an environment is, and what it may be able to do beyond that.
 
 `Environment` describes a task. What can be done with it are abilities: `Steppable` in JAX, `hindrl_jax.base.steppers.HostStepped` outside it,
-`Restorable` states, and observations that hindsight can change (`RelabelsObservations`). Whoever needs an ability asks for it, never for a kind.
+`Restorable` states, and observations that hindsight can change (`RelabelsObservations`). Code checks for the ability that it needs, not for a class.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def state_dim(env: Environment) -> int:
 
 @runtime_checkable
 class RestorableEnvironment(Steppable, Restorable, Protocol):
-    """What a task of one's own is: stepped in JAX, its states restorable."""
+    """A steppable environment with restorable states: what a task of your own is."""
 
 
 @runtime_checkable

@@ -12,39 +12,39 @@ from hindrl_jax.base.environments import Environment
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What a step of N environments has brought."""
+    """The result of one step of E environments."""
 
-    next_observation: np.ndarray  # (N, D) float32, the true next one
-    success: np.ndarray  # (N,) bool, the task was solved by this step
-    terminated: np.ndarray  # (N,) bool, the episode is over, be it by success or by the environment's own rules
-    truncated: np.ndarray  # (N,) bool, the horizon cut it; never both
-    observation: np.ndarray  # (N, D) float32, where the environments are now: in a new episode, if the old one is over
-    desired_goal: np.ndarray | None  # (N, G) float32, of the episode in which they are now; None where episodes have no goals of their own
+    next_observation: np.ndarray  # (E, D) float32, the true next one
+    success: np.ndarray  # (E,) bool, the task was solved by this step
+    terminated: np.ndarray  # (E,) bool, the episode is over, be it by success or by the environment's own rules
+    truncated: np.ndarray  # (E,) bool, the horizon cut it; never both
+    observation: np.ndarray  # (E, D) float32, where the environments are now: in a new episode, if the old one is over
+    desired_goal: np.ndarray | None  # (E, G) float32, of the episode in which they are now; None where episodes have no goals of their own
 
     @property
     def ended(self) -> np.ndarray:
-        """(N,) bool"""
+        """(E,) bool"""
         return self.terminated | self.truncated
 
 
 class Stepper(Protocol):
-    """N environments side by side, each of which begins anew as soon as its episode ends."""
+    """E environments side by side, each of which begins anew as soon as its episode ends."""
 
     @property
     def num_envs(self) -> int: ...
 
     def begin(self, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-        """Begins an episode in each: seeds (N,) uint32 -> observations (N, D), and desired goals (N, G) or None, see `Outcome`."""
+        """Begins an episode in each: seeds (E,) uint32 -> observations (E, D), and desired goals (E, G) or None, see `Outcome`."""
 
     def step(self, actions: np.ndarray) -> Outcome:
-        """Takes one step of each: actions (N, A) in the environment's own units."""
+        """Takes one step of each: actions (E, A) in the environment's own units."""
 
     def close(self) -> None:
         """Ends the environments."""
 
 
 class WatchedStepper(Stepper, Protocol):
-    """One environment that somebody looks at: an expert at what it observes, a person at pictures."""
+    """One environment with its raw observations, for an expert, and with pictures."""
 
     def step(self, actions: np.ndarray, *, begin_anew: bool = True) -> Outcome:
         """As of `Stepper`, but a new episode begins only if it is to, so that the last state can be looked at."""

@@ -1,6 +1,7 @@
-"""Data that every part of the project shares: episodes, batches and the interface of an environment.
+"""Data that every part of the project shares: time steps, episodes and batches.
 
-Shape letters, project-wide: B batch, T time (the horizon), N critics, Q quantiles, G goal, D observation, A action, E environments, S seeds.
+Shape letters, project-wide: B batch, T time (the horizon), C critics, Q quantiles, M atoms or goals of a table, G goal, D observation, A action,
+E environments, N episodes, U gradient steps of an iteration, S seeds.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ class Transition(struct.PyTreeNode, kw_only=True):
     achieved_goal: Array  # (B, G), where the observation is
     action: Array  # (B, A), in [-1, 1]
     reward: Array  # (B,), sum of the discounted rewards of the n steps
-    discount: Array  # (B,), factor of the bootstrapped value: gamma**steps, or 0 after termination
+    discount: Array  # (B,), factor of the bootstrapped value: gamma**steps, or 0 where the return has ended
     next_observation: Array  # (B, D)
     next_achieved_goal: Array  # (B, G)
     desired_goal: Array  # (B, G)

@@ -23,7 +23,7 @@ from hindrl_jax.core.relabel import num_relabelled, relabel, relabel_observation
 from hindrl_jax.core.replay import ReplayState, sample_episodes, sample_steps
 from hindrl_jax.core.steps import read_steps, transitions
 
-JUDGED_BY_GOAL = "judged_by_goal"
+REWARDED_BY_GOAL = "rewarded_by_goal"
 """The note of the replay on transitions of episodes that are rewarded for reaching their behavioural goal rather than by the environment."""
 
 
@@ -40,6 +40,7 @@ def num_demo_rows(env_steps: Array, config: BatchConfig) -> Array:
     if config.reach_zero is None:
         return jnp.asarray(config.max_demo_rows)
     remaining = jnp.maximum(1.0 - env_steps / config.reach_zero, 0.0)
+    # The minimum is for float32, whose product may round up where that of Python's floats, `max_demo_rows`, does not.
     return jnp.minimum(jnp.floor(config.max_demo_ratio * config.batch_size * remaining).astype(jnp.int32), config.max_demo_rows)
 
 
@@ -88,8 +89,8 @@ def rows_of_replay(key: Array, replay: ReplayState, rows: Rows, guidance: Guidan
             steps = relabel_observations(key, replay, steps, rows.relabelled, source, env)
         else:
             steps = relabel(key, replay, steps, rows.relabelled, source, test)
-    if JUDGED_BY_GOAL in replay.notes:
-        steps = reward_by_goal(steps, replay.notes[JUDGED_BY_GOAL][rows.row, rows.step] & ~steps.is_relabelled, test)
+    if REWARDED_BY_GOAL in replay.notes:
+        steps = reward_by_goal(steps, replay.notes[REWARDED_BY_GOAL][rows.row, rows.step] & ~steps.is_relabelled, test)
     return transitions(steps, env.achieved_goal, config, is_demonstration=False)
 
 
@@ -107,7 +108,7 @@ def sample_demonstrations(key: Array, demonstrations: Episodes, env: Environment
 
 
 def goal_test(guidance: Guidance, env: Environment, config: TrainConfig) -> GoalTest:
-    """When a goal of hindsight counts as reached."""
+    """When a goal counts as reached, wherever a reward is computed from goals."""
     return GoalTest(
         achieved_goal=env.achieved_goal,
         epsilon=guidance.epsilon,

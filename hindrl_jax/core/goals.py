@@ -94,7 +94,7 @@ def epsilon_filter(achieved_goals: Array, epsilon: Array, *, inclusive: bool = T
 
 
 class GoalTest(struct.PyTreeNode, kw_only=True):
-    """When a goal of hindsight counts as reached, and what that means for the return."""
+    """When a goal counts as reached, wherever a reward is computed from goals, and what that means for the return."""
 
     achieved_goal: Callable[[Array], Array] = struct.field(pytree_node=False)  # projection of observations (..., D) to goals (..., G)
     epsilon: Array  # (G,) half-width of the goal box

@@ -1,4 +1,4 @@
-"""What must be fast: truncation and the quantile Huber loss in two forms each, products in bfloat16, and batches cut into blocks.
+"""Performance-critical forms: truncation and the quantile Huber loss in two forms each, products in bfloat16, and batches cut into blocks.
 
 Atoms (quantiles) lie on the leading axes and the batch on the last: on a CPU that layout, not the arithmetic, decides the speed. The two forms have
 equal results and are chosen where the program is compiled: loops over the atoms, which keep a CPU's cache and vector units busy, and whole-array

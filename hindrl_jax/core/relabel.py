@@ -54,9 +54,9 @@ def reward_by_goal(steps: Steps, chosen: Array, test: GoalTest) -> Steps:
 
 
 def relabel_observations(key: Array, replay: ReplayState, steps: Steps, chosen: Array, source: GoalSource, env: RelabelsObservations) -> Steps:
-    """Rewrites what rows observe, as if the episode had been about other states, and rewards them where the task is then solved.
+    """Replaces the task's parameters in the observations of chosen rows, and rewards them where the task is then solved.
 
-    They end there whatever the goal test says: no row begins in a solved state, so the value of one is never learnt.
+    A solved state always ends the return, whatever the goal test says: no row starts in one, so its value is never trained.
 
     Args:
       key: random key.

@@ -1,7 +1,7 @@
 """Replay of whole episodes.
 
-A transition is never stored twice: an episode keeps its T + 1 observations once, next observations and achieved goals are read off the
-following rows, and relabelled goals, rewards and n-step returns are computed when a batch is drawn (the thesis's "online relabelling").
+A transition is never stored twice: an episode keeps its T + 1 observations once, and next observations are the following rows. Achieved goals,
+relabelled goals, rewards and n-step returns are computed when a batch is drawn (the thesis's "online relabelling").
 
 Every environment owns a ring of episode slots, so that writing needs no bookkeeping between environments. One slot per ring is being written;
 only complete episodes are sampled, and an episode is overwritten as a whole.

@@ -21,7 +21,7 @@ class Schedule(struct.PyTreeNode, kw_only=True):
 
 
 def linear(start: Any, end: Any, progress: Any) -> Any:
-    """Where a value is that moves linearly along a run: its field holds the start, the field named final_... the end, None if it does not move.
+    """Linear interpolation from start to end; constant if end is None.
 
     Args:
       start, end: numbers, or () arrays where they are swept.

@@ -29,8 +29,8 @@ class Steps(struct.PyTreeNode, kw_only=True):
     terminated: Array  # (B,) bool, whether its end is a termination, rather than a truncation
     steps_left: Array  # (B,) int32, from the first of these steps to the last one of the episode
     last_reward: Array  # (B,), at the last step of the episode
-    ends: Array  # (B, n) bool, whether hindsight has the return end there
-    has_recorded_rewards: Array  # (B,) bool; else they are those of hindsight, of which the episode's last reward says nothing
+    ends: Array  # (B, n) bool, whether the return ends there because a goal is reached
+    has_recorded_rewards: Array  # (B,) bool; else they are computed from goals, of which the episode's last reward says nothing
     is_relabelled: Array  # (B,) bool, whether the goal, or the observations, are those of hindsight
 
 
@@ -78,7 +78,8 @@ def transitions(steps: Steps, achieved_goal: Callable[[Array], Array], config: T
       is_demonstration: marks the rows for the behaviour cloning loss.
 
     Returns:
-      The batch. Where the return ended by termination the discount is 0, else gamma to the number of steps taken.
+      The batch. The discount is 0 where the return ended by termination, by hindsight, or at a time-out under `timeouts_are_terminal`; else gamma to
+      the number of steps taken.
     """
     gamma = config.batch.gamma
     ends = steps.ends | (steps.is_last if config.quirks.timeouts_are_terminal else steps.is_last & steps.terminated[:, None])

@@ -19,7 +19,7 @@ from hindrl_jax.config import TrainConfig
 from hindrl_jax.core import agent as agents
 from hindrl_jax.core import replay, rollout
 from hindrl_jax.core.agent import AgentState, Metrics, Policy
-from hindrl_jax.core.batch import JUDGED_BY_GOAL, goal_test, sample_batch, sample_demonstrations
+from hindrl_jax.core.batch import REWARDED_BY_GOAL, goal_test, sample_batch, sample_demonstrations
 from hindrl_jax.core.goals import nearby_goal
 from hindrl_jax.core.guidance import Guidance
 from hindrl_jax.core.hindsight import NEARBY_GOAL, hindsight_steps
@@ -72,7 +72,9 @@ def init(
     """A fresh agent, an empty replay and `num_envs` episodes about to begin.
 
     Args:
-      key, guidance, env, config: see the module's other functions.
+      key: random key.
+      guidance: from `guidance.guidance`.
+      env, config: static.
       sampler: how batches will be drawn.
       begun: the episodes, where they have begun outside JAX.
 
@@ -82,7 +84,7 @@ def init(
     key_agent, key_rollout, key_train = jax.random.split(key, 3)
     capacity = config.buffer_size if config.learns_from_rollouts else 2 * config.num_envs * env.horizon  # the smallest one
     notes: dict[str, int] = {NEARBY_GOAL: -1} if config.batch.uses_intersections else {}
-    notes |= {JUDGED_BY_GOAL: False} if config.goal.has_achieved_goals else {}
+    notes |= {REWARDED_BY_GOAL: False} if config.goal.has_achieved_goals else {}
     if begun is None:
         begun = _new_episodes(key_rollout, guidance, cast(Steppable, env), config, 0.0)
     empty = replay.init(env, num_envs=config.num_envs, capacity=capacity, notes=notes)
@@ -108,8 +110,8 @@ def _new_episodes(key: Array, guidance: Guidance, env: Steppable, config: TrainC
 
 
 def _with_notes(episodes: RolloutState, config: TrainConfig) -> RolloutState:
-    """New episodes, which are judged by the environment, with what is noted of them."""
-    return episodes.replace(notes={JUDGED_BY_GOAL: jnp.zeros(config.num_envs, bool)} if config.goal.has_achieved_goals else {})
+    """New episodes, which are rewarded by the environment, with what is noted of them."""
+    return episodes.replace(notes={REWARDED_BY_GOAL: jnp.zeros(config.num_envs, bool)} if config.goal.has_achieved_goals else {})
 
 
 def _with_achieved_goals(key: Array, episodes: RolloutState, state: TrainState, env: Environment, config: TrainConfig) -> RolloutState:
@@ -121,7 +123,7 @@ def _with_achieved_goals(key: Array, episodes: RolloutState, state: TrainState, 
     steps = hindsight_steps(key_step, jnp.zeros_like(rows), past.episodes.lengths[rows], source="episode")
     chosen = jax.random.bernoulli(key_choice, share, (num_envs,)) & (jnp.sum(past.num_complete) > 0)
     achieved = env.achieved_goal(past.episodes.observations[rows, steps])
-    return episodes.replace(desired_goal=jnp.where(chosen[:, None], achieved, episodes.desired_goal), notes={JUDGED_BY_GOAL: chosen})
+    return episodes.replace(desired_goal=jnp.where(chosen[:, None], achieved, episodes.desired_goal), notes={REWARDED_BY_GOAL: chosen})
 
 
 def _progress(state: TrainState, config: TrainConfig) -> Array:
@@ -222,7 +224,7 @@ def record(key: Array, state: TrainState, taken: tuple[Array, TimeStep], guidanc
 
 def continue_from(key: Array, state: TrainState, after: RolloutState, time_step: TimeStep, env: Environment, config: TrainConfig) -> TrainState:
     """Goes on from where the environments are after a recorded step: in a new episode, those whose episode has ended."""
-    if config.goal.has_achieved_goals:  # read from what is stored by now: of the replay as it was, a copy would have to be kept
+    if config.goal.has_achieved_goals:  # read after storing, so that the old replay can be donated
         begun = _with_achieved_goals(key, after, state, env, config)
         after = tree_where(time_step.terminated | time_step.truncated, begun, after)
     return state.replace(rollout=after, env_steps=state.env_steps + config.num_envs)

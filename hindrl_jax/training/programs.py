@@ -30,7 +30,7 @@ from hindrl_jax.training.devices import free_memory, over_seeds, seed_mesh, shap
 from hindrl_jax.training.prioritised import sampler_for
 
 FRESH_EPISODES = 100
-"""By which a finished run is judged."""
+"""Episodes of the evaluation of a finished run."""
 CHUNKS_PER_EVALUATION = 10
 Values = dict[str, Array]
 """The swept fields of the config, and their values: of one run, or (S,)."""
@@ -97,7 +97,7 @@ class Programs(abc.ABC):
         """Plays fresh episodes: `eval_episodes` of the config, or `FRESH_EPISODES`. Returns the keys of later ones, too."""
 
     def close(self) -> None:  # noqa: B027, there is nothing to end where JAX steps the environments
-        """Ends what does not end by itself."""
+        """Closes the environments."""
 
     @contextlib.contextmanager
     def _compiler(self) -> Iterator[Compile]:
@@ -177,7 +177,7 @@ class JaxPrograms(Programs):
 
 
 def extent(env: Environment, config: TrainConfig) -> tuple[int, int]:
-    """Iterations of the random steps at the start, and of a chunk: ten chunks for each evaluation, or one if that is more.
+    """Random iterations at the start, and iterations of a chunk: a tenth of the steps between evaluations, at most what is left to learn, at least 1.
 
     Raises:
       UserError: if nothing is left to learn in.

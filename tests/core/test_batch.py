@@ -36,7 +36,7 @@ from numbered_replay import (
 )
 
 from hindrl_jax.config import BatchConfig, QuirksConfig, TrainConfig
-from hindrl_jax.core.batch import JUDGED_BY_GOAL, num_demo_rows, rows_of_demonstrations, sample_batch, sample_demonstrations
+from hindrl_jax.core.batch import REWARDED_BY_GOAL, num_demo_rows, rows_of_demonstrations, sample_batch, sample_demonstrations
 
 NUMBERED = Numbered()
 
@@ -114,7 +114,7 @@ def test_episodes_judged_by_their_goal_do_not_change_what_relabelled_observation
     # No state equals a behavioural goal, so that original rows of such episodes get no reward.
     history, _ = replay_history([[3, 2], [1, 3]])
     replay, config = at(history, 17), TrainConfig(batch=batch_of("future"))
-    judged = replay.replace(notes={JUDGED_BY_GOAL: np.ones_like(replay.episodes.rewards, bool)})
+    judged = replay.replace(notes={REWARDED_BY_GOAL: np.ones_like(replay.episodes.rewards, bool)})
     expected, batch = (jax.device_get(draw_batch(jax.random.key(0), given, config, env=NumberedTask())) for given in (replay, judged))
     np.testing.assert_array_equal(batch.observation, expected.observation)
     relabelled, original = batch.is_relabelled, ~batch.is_relabelled & ~batch.is_demonstration
@@ -159,7 +159,7 @@ def test_episodes_judged_by_their_goal_are_rewarded_for_reaching_it(n_step):
     goals = np.array(replay.episodes.desired_goals)
     goals[:SLOTS] = replay.episodes.observations[:SLOTS, 2]
     judged = np.broadcast_to(np.arange(2 * SLOTS)[:, None] < SLOTS, (2 * SLOTS, HORIZON))
-    replay = replay.replace(episodes=replay.episodes.replace(desired_goals=goals), notes={JUDGED_BY_GOAL: judged})
+    replay = replay.replace(episodes=replay.episodes.replace(desired_goals=goals), notes={REWARDED_BY_GOAL: judged})
     batch_config = dataclasses.replace(BATCH, relabelled_per_original=0.5, hindrl_sampling_strategy="final", n_step=n_step, max_demo_ratio=0.0)
     config = TrainConfig(batch=batch_config)
     batch = jax.device_get(draw_batch(jax.random.key(2), replay, config))

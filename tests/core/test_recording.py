@@ -23,7 +23,7 @@ from toy_env import corridor_demonstrations
 from hindrl_jax.config import BatchConfig, GoalConfig
 from hindrl_jax.core import agent as agents
 from hindrl_jax.core import train
-from hindrl_jax.core.batch import JUDGED_BY_GOAL, sample_batch
+from hindrl_jax.core.batch import REWARDED_BY_GOAL, sample_batch
 from hindrl_jax.core.hindsight import NEARBY_GOAL
 
 
@@ -169,7 +169,7 @@ def test_achieved_goals_are_given_to_new_episodes_and_judge_them():
     replay, task_goal = jax.device_get(state.replay), float(data.behavioural_goals.goals[0, 0])
     goals, seen, num_episodes = [], set(), 0
     for row, length, episode in recorded_episodes(replay):
-        (judged,) = set(replay.notes[JUDGED_BY_GOAL][row, :length].tolist())  # the same in all of an episode
+        (judged,) = set(replay.notes[REWARDED_BY_GOAL][row, :length].tolist())  # the same in all of an episode
         if judged:
             goals.append(float(episode.desired_goals[0]))
         else:
@@ -210,7 +210,7 @@ def test_the_share_of_achieved_goals_moves_linearly():
 
         def at(env_steps):
             begun = train._with_achieved_goals(key_goals, episodes, state.replace(env_steps=env_steps), env, config)
-            return jnp.sum(begun.notes[JUDGED_BY_GOAL])
+            return jnp.sum(begun.notes[REWARDED_BY_GOAL])
 
         return jax.vmap(at)(jnp.array([0, 500_000, 1_000_000]))
 

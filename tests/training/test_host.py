@@ -15,7 +15,7 @@ import hindrl_jax as hindrl
 from hindrl_jax import cli
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.config import PriorityConfig
-from hindrl_jax.core.batch import JUDGED_BY_GOAL
+from hindrl_jax.core.batch import REWARDED_BY_GOAL
 from hindrl_jax.core.hindsight import NEARBY_GOAL
 from hindrl_jax.runs.checkpoints import Checkpoints
 from hindrl_jax.tasks.simulators import Simulators
@@ -181,7 +181,7 @@ def test_other_options_work_as_well(env, demonstrations):
     assert result.updates == 3 + 2 * (result.env_steps - 40) // 4
     assert (replay.notes[NEARBY_GOAL] >= 0).any()
     complete = replay.episodes.lengths[0] > 0
-    assert 0.1 < replay.notes[JUDGED_BY_GOAL][0, complete].mean() < 0.9  # the goals of these episodes were chosen here, and kept
+    assert 0.1 < replay.notes[REWARDED_BY_GOAL][0, complete].mean() < 0.9  # the goals of these episodes were chosen here, and kept
     assert len(np.unique(replay.episodes.desired_goals[0, complete], axis=0)) == complete.sum()
 
 
@@ -244,6 +244,6 @@ def test_goals_are_behavioural_ones_where_an_environment_gives_none(tmp_path):
     assert all(stepper.closed for stepper in HostCorridor.made)
     resumed = hindrl.fit(env, demonstrations, task, restore=checkpoints.restore)
     replay = jax.device_get(resumed.state.replay)
-    complete, judged = replay.episodes.lengths[0] > 0, replay.notes[JUDGED_BY_GOAL][0, :, 0]
+    complete, judged = replay.episodes.lengths[0] > 0, replay.notes[REWARDED_BY_GOAL][0, :, 0]
     assert (replay.episodes.desired_goals[0, complete & ~judged] == 3.0).all()
     assert 0 < judged[complete].mean() < 1  # the goals of these episodes were achieved earlier
