@@ -26,11 +26,11 @@ from hindrl_jax.envs.reach import FixedParameterizedReach
 from hindrl_jax.experts.reach import ReachExpert
 from hindrl_jax.experts.robosuite_arm import arm as arms
 from hindrl_jax.experts.robosuite_arm import installation, playing, scene, shared_arm
-from hindrl_jax.runs import reader
 from hindrl_jax.runs import writer as runs
 from hindrl_jax.runs.reader import Run, load_run
 from hindrl_jax.runs.spec import RunSpec
 from hindrl_jax.tasks.registry import make
+from hindrl_jax.training import playing as trained_playing
 from hindrl_jax.training.experiment import fit
 from hindrl_jax.training.recording import record
 
@@ -187,7 +187,7 @@ def test_each_seed_plays_its_own_policy_towards_one_of_its_goals_per_episode(run
 
         return play_one
 
-    monkeypatch.setattr(reader, "player", stub_player)
+    monkeypatch.setattr(trained_playing, "player", stub_player)
     loaded.evaluate(episodes=4)
     assert len(acted) == 8
     observation = env.reset(jax.random.key(0))[1][None]
