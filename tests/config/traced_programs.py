@@ -1,6 +1,7 @@
 """The training program of a config as it is traced, to be compared with that of another config."""
 
 import itertools
+import re
 
 import jax
 import numpy as np
@@ -87,7 +88,8 @@ class Traced:
         is_used = [output in used_outputs for output in outputs or paths(self.shapes)]
         alive, used_constants, used_inputs = partial_eval.dce_jaxpr_consts(self.closed.jaxpr, is_used)
         constants = [np.asarray(value).tolist() for value, is_used in zip(self.closed.consts, used_constants, strict=True) if is_used]
-        self.text, self.used_outputs = f"{alive} {constants}", used_outputs
+        # Newer JAX writes down which Python structures a loop was called with, unused parts included.
+        self.text, self.used_outputs = re.sub(r"\n\s*ft_(in|out)=.*", "", f"{alive} {constants}"), used_outputs
         self.used_inputs = {name for name, is_used in zip(self.inputs, used_inputs, strict=True) if is_used}
 
 
