@@ -162,7 +162,7 @@ class HostPrograms(Programs):
 
     def _with_new_episodes(self, state: TrainState, guidance: Guidance) -> TrainState:
         """The state of a run that goes on from a checkpoint, where nobody knows how its environments stood: their episodes are lost."""
-        keys = jax.vmap(functools.partial(jax.random.fold_in, data=7))(state.key)
+        keys = jax.vmap(functools.partial(jax.random.fold_in, data=7))(state.key)  # 7, and 6 below: `decide` splits this key in six
         seeds = np.asarray(jax.vmap(lambda key: jax.random.bits(key, self._shape[1:]))(keys))
         begun = self._begin(seeds.reshape(-1))
         if begun.desired_goal is None:

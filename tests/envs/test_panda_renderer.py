@@ -19,15 +19,6 @@ LEFT, MIDDLE, RIGHT = (0.5, -0.25, 0.25), (0.6, 0.0, 0.35), (0.5, 0.28, 0.15)  #
 ROOT = Path(__file__).parent.parent.parent
 
 
-@pytest.fixture
-def opengl_here():
-    """The pictures need an OpenGL library on the machine."""
-    try:
-        viewer._renderer()
-    except UserError as error:
-        pytest.skip(str(error))
-
-
 needs_opengl = pytest.mark.usefixtures("opengl_here")
 
 
