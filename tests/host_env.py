@@ -70,6 +70,6 @@ class HostCorridor:
     def task_goal(self):
         return jnp.array([self.width])
 
-    def stepper(self, num_envs):
+    def stepper(self, num_envs, *, num_held=1):
         self.made.append(CorridorStepper(self, num_envs))
         return self.made[-1]

@@ -23,7 +23,7 @@ Act = Callable[[Array, ReachState, Array], Array]
 """(key, state, observation (D,)) -> action (6,) in the environment's own units."""
 
 
-def play_in_robosuite(key: Array, env: ReachTask, act: Act, num_episodes: int) -> Episodes:
+def play_in_robosuite(key: Array, env: ReachTask, act: Act, num_episodes: int, num_held: int = 1) -> Episodes:
     """Plays episodes one after the other, with the arm in robosuite.
 
     Equal keys give the same starts, waypoints and keys for `act` as in `hindrl_jax.training.recording.play`. `act` is compiled once, however often
@@ -34,6 +34,7 @@ def play_in_robosuite(key: Array, env: ReachTask, act: Act, num_episodes: int) -
       env: the task, of any back end.
       act: (key, state, observation (D,)) -> action (6,) in m and rad, which is clipped to the environment's bounds before it goes to robosuite.
       num_episodes: N.
+      num_held: steps for which each action is held.
 
     Returns:
       N episodes. Past the end of an episode observations and states are repeated, and actions are 0.
@@ -42,11 +43,11 @@ def play_in_robosuite(key: Array, env: ReachTask, act: Act, num_episodes: int) -
       UserError: if robosuite is missing or unusable.
     """
     arm = shared_arm(env.num_waypoints)
-    episodes = [play_episode(key, env, arm, functools.partial(_act, act)) for key in jax.random.split(key, num_episodes)]
+    episodes = [play_episode(key, env, arm, functools.partial(_act, act), num_held) for key in jax.random.split(key, num_episodes)]
     return stacked(episodes)
 
 
-def play_episode(key: Array, env: ReachTask, arm: RobosuiteArm, act: Act) -> Episodes:
+def play_episode(key: Array, env: ReachTask, arm: RobosuiteArm, act: Act, num_held: int = 1) -> Episodes:
     """Plays one episode on the host.
 
     Args:
@@ -54,6 +55,7 @@ def play_episode(key: Array, env: ReachTask, arm: RobosuiteArm, act: Act) -> Epi
       env: the task.
       arm: anything with the methods `reset` and `step` of `RobosuiteArm`.
       act: as for `play_in_robosuite`, but any Python function.
+      num_held: steps for which each action is held.
 
     Returns:
       The episode, NumPy leaves without the episode axis.
@@ -62,9 +64,10 @@ def play_episode(key: Array, env: ReachTask, arm: RobosuiteArm, act: Act) -> Epi
     state, observation, vector = _start(env, key_reset)
     arm.reset(*jax.device_get((state.joints, state.positions, state.rotations)))
     observations, states, actions, rewards = [observation], [vector], [], []
-    for _ in range(env.horizon):
+    for index in range(env.horizon):
         key, key_act = jax.random.split(key)
-        action = act(key_act, state, observation)
+        if index % num_held == 0:
+            action = act(key_act, state, observation)
         command, normalised = _command(env, action)
         joints, velocities = arm.step(np.asarray(command))
         state, time_step, vector = _arrive(env, state, np.float32(joints), np.float32(velocities))

@@ -71,8 +71,8 @@ class HostStepped(Environment, Protocol):
     def gives_goals(self) -> bool:
         """Whether each of its episodes comes with a goal of its own, rather than with a behavioural goal from the demonstrations."""
 
-    def stepper(self, num_envs: int) -> Stepper:
-        """That many environments side by side."""
+    def stepper(self, num_envs: int, *, num_held: int = 1) -> Stepper:
+        """That many environments side by side, which hold each action for `num_held` steps, or until the episode is over."""
 
 
 @runtime_checkable

@@ -29,6 +29,8 @@ class Eval:
     """Which episodes: equal numbers give equal ones, in the same back end."""
     stochastic: bool = False
     """Sample the actions instead of taking the mean ones."""
+    last: bool = False
+    """The policies at the end of the run, instead of the best that it has seen."""
     backend: str | None = None
     """Simulate the environment with another of its back ends, for example robosuite, which plays one episode after the other."""
 
@@ -38,7 +40,7 @@ def evaluate(arguments: list[str]) -> None:
     options = parse(Eval, arguments, "hindrl eval")
     if options.episodes < 1:
         raise UserError(f"--episodes {options.episodes} is too few: play at least 1")
-    run = load_run(options.directory)
+    run = load_run(options.directory, last=options.last)
     if options.backend is not None:
         run = run.in_backend(options.backend)
     columns = (TextColumn("{task.completed}/{task.total} episodes"), BarColumn(), TimeRemainingColumn())
@@ -74,6 +76,8 @@ class Render:
     """How many, one after the other, from that one on."""
     stochastic: bool = False
     """Sample the actions instead of taking the mean ones."""
+    last: bool = False
+    """The policy at the end of the run, instead of the best that it has seen."""
 
 
 def render(arguments: list[str]) -> None:
@@ -81,7 +85,7 @@ def render(arguments: list[str]) -> None:
     options = parse(Render, arguments, "hindrl render")
     if options.episodes < 1:
         raise UserError(f"--episodes {options.episodes} is too few: film at least 1")
-    run = load_run(options.directory)
+    run = load_run(options.directory, last=options.last)
     path = options.to or options.directory / f"episode_{options.episode}_seed_{run.spec.seeds[0] if options.seed is None else options.seed}.gif"
     keys = jnp.stack([episode_key(options.episode + number) for number in range(options.episodes)])
     solved = run.render(path, seed=options.seed, key=keys, stochastic=options.stochastic)

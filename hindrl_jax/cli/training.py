@@ -38,17 +38,20 @@ def train(arguments: list[str]) -> None:
 
 
 def _summary_table(summary: dict[str, Any], config: TrainConfig) -> Table:
+    """A line for each seed: the policy that was kept, the last one, and when 95% was reached first."""
     cloning = not config.learns_from_rollouts  # and so takes no environment steps
-    table = Table("seed", "final", "best", "length", "95% after", *([] if cloning else ["updates"]), "seconds", box=box.SIMPLE_HEAD)
+    unit, updates = ("updates", []) if cloning else ("env_steps", ["updates"])
+    table = Table("seed", "kept", "length", "of update" if cloning else "of step", "last", "95% after", *updates, "seconds", box=box.SIMPLE_HEAD)
     for column in table.columns:
         column.justify = "right"
     for seed in summary["seeds"]:
-        cells = [str(seed["seed"]), f"{seed['final_success']:.0%}", f"{seed['best_success']:.0%}", f"{seed['episode_length']:.1f}"]
+        cells = [str(seed["seed"]), f"{seed['returned_success']:.0%}", f"{seed['returned_length']:.1f}", f"{seed[f'returned_{unit}']:,}"]
+        cells.append(f"{seed['final_success']:.0%}")
         if seed["updates_to_95"] is None:
             cells.append("never")
         else:
-            updates = f"{seed['updates_to_95']:,}"
-            cells += [f"{updates} updates"] if cloning else [f"{seed['env_steps_to_95']:,} steps", updates]
+            cells.append(f"{seed[f'{unit}_to_95']:,} {unit.removeprefix('env_')}")
+            cells += [f"{seed['updates_to_95']:,}"] * len(updates)
             cells.append(f"{seed['seconds_to_95']:.1f}")
         table.add_row(*cells)
     return table

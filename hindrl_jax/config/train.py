@@ -25,6 +25,9 @@ class TrainConfig:
     """Environment steps of the run per seed, rounded up to a tenth of eval_every; for bc, which takes none, gradient steps."""
     num_envs: int = 16
     """Environments stepped side by side."""
+    action_hold: int | None = None
+    """Control steps for which each action is held: one decision of the policy. Steps, horizon and episode lengths count control steps; epsilon_steps,
+    n_step and gamma count decisions. None lets `fit` choose: as many as leave the median demonstration at least 60 decisions."""
     updates_per_iteration: int = 2
     """Gradient steps after each (vectorised) environment step."""
     learning_starts: int = 1_600
@@ -47,6 +50,9 @@ class TrainConfig:
     primacy bias in deep reinforcement learning, 2022)."""
     buffer_size: int = 500_000
     """Transitions that the replay holds."""
+    stop_at: float | None = None
+    """Success at which a seed's policy is taken as found: an evaluation reaches it, and 100 fresh episodes confirm it. When all seeds have one, the
+    run ends. None runs to the end."""
     eval_every: int = 4_000
     """Environment steps (bc: gradient steps) between evaluations."""
     eval_episodes: int = 100
@@ -63,6 +69,8 @@ class TrainConfig:
         check(
             self,
             **{name: (getattr(self, name) >= 1, "at least 1") for name in counts},
+            action_hold=(self.action_hold is None or self.action_hold >= 1, "at least 1, or None"),
+            stop_at=(self.stop_at is None or 0.0 < self.stop_at <= 1.0, "greater than 0 and at most 1, or None"),
             learning_starts=(self.learning_starts >= 0, "0 or more"),
             demo_reset_ratio=(0.0 <= self.demo_reset_ratio <= 1.0, "between 0 and 1"),
             demo_reset_curriculum=(0.0 <= self.demo_reset_curriculum <= 1.0, "between 0 and 1"),
@@ -92,6 +100,11 @@ class TrainConfig:
                 f"reach_zero = {self.batch.reach_zero} is of no use with priority_exponent = {self.priority.priority_exponent}, by which the share "
                 "of demonstrations follows from their priorities: set one of them to None or 0"
             )
+
+    @property
+    def steps_per_iteration(self) -> int:
+        """Control steps that all environments take together for one decision each."""
+        return self.num_envs * (self.action_hold or 1)
 
     @property
     def learns_from_rollouts(self) -> bool:

@@ -156,8 +156,8 @@ def _reset_agent_if_due(state: TrainState, env: Environment, config: TrainConfig
 
 
 def warm_up_iterations(env: Environment, config: TrainConfig) -> int:
-    """Steps of every environment before learning: `learning_starts` in all, and enough for a complete episode in each."""
-    return max(-(-config.learning_starts // config.num_envs), env.horizon)
+    """Decisions in every environment before learning: `learning_starts` in all, and enough for a complete episode in each."""
+    return max(-(-config.learning_starts // config.steps_per_iteration), env.horizon)
 
 
 def make_policy(policy: Policy, env: Environment, config: TrainConfig, *, stochastic: bool) -> Act:
@@ -227,7 +227,7 @@ def continue_from(key: Array, state: TrainState, after: RolloutState, time_step:
     if config.goal.has_achieved_goals:  # read after storing, so that the old replay can be donated
         begun = _with_achieved_goals(key, after, state, env, config)
         after = tree_where(time_step.terminated | time_step.truncated, begun, after)
-    return state.replace(rollout=after, env_steps=state.env_steps + config.num_envs)
+    return state.replace(rollout=after, env_steps=state.env_steps + config.steps_per_iteration)
 
 
 def collect(

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from hindrl_jax.plotting.figures import DEMONSTRATION, MEAN, SEED, band, colours, figure, legend_beside, mark_success, mean_line, pyplot
+from hindrl_jax.plotting.figures import DEMONSTRATION, MEAN, RETURNED, SEED, band, colours, figure, legend_beside, mark_success, mean_line, pyplot
 from hindrl_jax.training.result import Result
 
 
@@ -20,7 +21,8 @@ def save_curve(result: Result, path: Path) -> None:
                 axis.plot(x, values, color=SEED, linewidth=0.6)
                 band(axis, x, values, MEAN)
             mean_line(axis, x, values, colour=MEAN, label=_mean_label(result))
-        lengths = np.asarray(result.guidance.demonstrations.lengths)
+        _mark_events(axes[0], result)
+        lengths = np.asarray(result.guidance.demonstrations.lengths) * (result.config.action_hold or 1)
         axes[1].axhline(lengths.mean(), color=DEMONSTRATION, linestyle="--", linewidth=1, label="demonstrations")
         axes[0].legend(loc="lower right", frameon=False)
         axes[1].set(ylim=(0, result.env.horizon * 1.05), ylabel="episode length, steps", xlabel=_x_label(result))
@@ -76,6 +78,15 @@ def _curves(result: Result) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rows = [(row.env_steps if result.config.learns_from_rollouts else row.updates, 100 * row.success, row.episode_length) for row in result.rows]
     table = np.asarray(rows, np.float64).reshape(-1, len(result.seeds), 3)
     return table[:, 0, 0], table[:, :, 1], table[:, :, 2]
+
+
+def _mark_events(axis: Any, result: Result) -> None:
+    """Where the agent began anew, and the policies that are returned."""
+    for share in result.config.agent_resets:
+        axis.axvline(share * result.config.steps, color="0.7", linestyle=":", linewidth=1)
+    if result.returned is not None:
+        steps = result.returned.env_steps if result.config.learns_from_rollouts else result.returned.updates
+        axis.scatter(steps, 100 * result.returned.success, s=18, color=RETURNED, marker="o", zorder=5, label="returned")
 
 
 def _x_label(result: Result) -> str:

@@ -12,8 +12,8 @@ import numpy as np
 
 from hindrl_jax.plotting.statistics import bootstrap_band
 
-MEAN, SEED, DEMONSTRATION = "#1f5fa8", "#9dbfe3", "#c77b00"
-"""Colours: the mean over seeds, a single seed, demonstrations."""
+MEAN, SEED, DEMONSTRATION, RETURNED = "#1f5fa8", "#9dbfe3", "#c77b00", "#b3261e"
+"""Colours: the mean over seeds, a single seed, demonstrations, the policies that are returned."""
 BETTER, WORSE, OPEN = "#1f5fa8", "#b3261e", "0.5"
 """Colours: what a difference says."""
 

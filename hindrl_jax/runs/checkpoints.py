@@ -31,9 +31,9 @@ from hindrl_jax.base.files import DAMAGED_ARCHIVE, read_arrays, write_atomically
 from hindrl_jax.base.types import Episodes
 from hindrl_jax.training.result import Result, Row
 
-LAYOUT = 1
+LAYOUT = 2
 DEMONSTRATIONS = "demonstrations.npz"
-_ARRAYS = ("guidance", "state", "key")
+_ARRAYS = ("guidance", "state", "key", "kept")
 _COUNTERS = ("env_steps", "updates", "train_seconds")
 
 
@@ -78,6 +78,7 @@ class Checkpoints:
             "shapes": _shapes(arrays),
             "rows": [dataclasses.asdict(row) for row in result.rows],
             "chunks": [{name: [float(value) for value in values] for name, values in chunk.items()} for chunk in result.chunks],
+            "evaluation_steps": [] if result.evaluation_steps is None else result.evaluation_steps.tolist(),
             **{name: getattr(result, name) for name in _COUNTERS},
         }
         path = self.folder / str(result.steps_done)
@@ -110,12 +111,14 @@ class Checkpoints:
         with self._damage(path), ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
             arrays = checkpointer.restore(path, args=ocp.args.Composite(arrays=ocp.args.StandardRestore(target))).arrays
             leaves = [_as(shapes[name], arrays[name]) for name in shapes]
-            guidance, state, key = jax.tree.unflatten(jax.tree.structure(_trees(begun)), leaves)
+            guidance, state, key, kept = jax.tree.unflatten(jax.tree.structure(_trees(begun)), leaves)
             restored = dataclasses.replace(
                 begun,
                 guidance=guidance,
                 state=state,
                 key=key,
+                kept=kept,
+                evaluation_steps=np.asarray(progress["evaluation_steps"], np.int64) if progress["rows"] else None,
                 rows=[Row(**row) for row in progress["rows"]],
                 chunks=[{name: np.asarray(values, np.float32) for name, values in chunk.items()} for chunk in progress["chunks"]],
                 **{name: progress[name] for name in _COUNTERS},
@@ -241,12 +244,15 @@ def _plain(leaf: Any) -> Any:
     return jax.random.key_data(leaf) if _is_key(leaf) else leaf
 
 
-def _plain_shape(leaf: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
+def _plain_shape(leaf: Any) -> Any:
+    """What Orbax is to read; numpy arrays as such."""
+    if isinstance(leaf, np.ndarray):
+        return leaf
     plain = jax.eval_shape(_plain, leaf)
     return jax.ShapeDtypeStruct(plain.shape, plain.dtype, sharding=leaf.sharding)
 
 
-def _as(shape: jax.ShapeDtypeStruct, array: jax.Array) -> jax.Array:
+def _as(shape: Any, array: Any) -> Any:
     return jax.random.wrap_key_data(array) if _is_key(shape) else array
 
 

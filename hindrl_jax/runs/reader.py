@@ -146,8 +146,12 @@ def draw_episodes(path: Path, env: Environment, episodes: Sequence[np.ndarray]) 
         save_film(env, unpacked, path)
 
 
-def load_run(path: str | os.PathLike[str]) -> Run:
+def load_run(path: str | os.PathLike[str], *, last: bool = False) -> Run:
     """Reads a run's directory.
+
+    Args:
+      path: the directory.
+      last: take the policies at the end of the run, instead of the best that each seed has seen.
 
     Raises:
       UserError: if it is not the directory of a finished run.
@@ -160,8 +164,9 @@ def load_run(path: str | os.PathLike[str]) -> Run:
     try:
         tree = unflatten_dict({name: jnp.asarray(array) for name, array in read_arrays(file).items()}, sep="/")
         goals = GoalTable(goals=tree["behavioural_goals"]["goals"], count=tree["behavioural_goals"]["count"])
+        # Runs from before policies were kept have one, the last.
         scale = _input_scale(tree["input_scale"])
-        policies = Policy(actor=tree["policy"], scale=scale)
+        policies = Policy(actor=tree["last_policy" if last and "last_policy" in tree else "policy"], scale=scale)
     except DAMAGED_ARCHIVE as error:
         raise UserError(f"{file} is damaged ({one_line(error)}): train again") from error
     return Run(path=path, spec=spec, policies=policies, behavioural_goals=goals)

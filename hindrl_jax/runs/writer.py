@@ -189,7 +189,8 @@ def peak_memory_bytes() -> int:
 def _save_parameters(path: Path, result: Result) -> None:
     agent, goals, scale = result.state.agent, result.guidance.behavioural_goals, result.state.agent.scale
     tree = {
-        "policy": agent.average_actor,
+        "policy": result.returned.actor,
+        "last_policy": agent.average_actor,
         "actor": agent.actor,
         "critics": agent.critics,
         "log_alpha": agent.log_alpha,

@@ -107,8 +107,8 @@ class GymnasiumEnv:
     def task_goal(self) -> Array:
         raise UserError(f"{self.name} has no one goal for all episodes: choose other behavioural goals")
 
-    def stepper(self, num_envs: int) -> Simulators:
-        return Simulators(self, num_envs)
+    def stepper(self, num_envs: int, *, num_held: int = 1) -> Simulators:
+        return Simulators(self, num_envs, num_held=num_held)
 
     def watched(self, *, with_pictures: bool) -> Simulators:
         return Simulators(dataclasses.replace(self, vectorization="sync"), 1, render_mode="rgb_array" if with_pictures else None)

@@ -28,8 +28,8 @@ from hindrl_jax.tasks import from_gymnasium
 Family = Literal["grid", "reach", "gymnasium"]
 Act = Callable[[Array, Any, Array], Array]
 """(key, state, observation (D,)) -> action (A,) in the environment's own units."""
-Player = Callable[[Array, Any, Act, int], Episodes]
-"""(key, environment, act, N) -> N episodes, played one after the other; `act` is compiled."""
+Player = Callable[[Array, Any, Act, int, int], Episodes]
+"""(key, environment, act, N, steps for which each action is held) -> N episodes, played one after the other; `act` is compiled."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,6 +15,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.base.steppers import Outcome
+from hindrl_jax.tasks.held_actions import make_held
 from hindrl_jax.tasks.ids import make_single
 
 _KEYS = ("observation", "achieved_goal", "desired_goal")
@@ -102,12 +103,13 @@ def describe(gymnasium_id: str, make_kwargs: tuple[str, ...]) -> Description:
 class Simulators:
     """N environments side by side, a `base.steppers.Stepper`; of one alone a `WatchedStepper`."""
 
-    def __init__(self, env: Any, num_envs: int, *, render_mode: str | None = None):
+    def __init__(self, env: Any, num_envs: int, *, num_held: int = 1, render_mode: str | None = None):
         """Starts them.
 
         Args:
           env: a `from_gymnasium.GymnasiumEnv`.
           num_envs: N.
+          num_held: steps for which each action is held.
           render_mode: "rgb_array" for pictures.
         """
         self.env, self.num_envs = env, num_envs
@@ -115,6 +117,9 @@ class Simulators:
             # Else Gymnasium would try one library after the other, and the first failure spoils the next.
             os.environ["MUJOCO_GL"] = importlib.import_module("hindrl_jax.envs.panda.opengl").opengl_library()
         make = functools.partial(make_single, env.id, env.arguments, env.horizon, render_mode)
+        if num_held > 1:
+            what = env.description
+            make = functools.partial(make_held, make, num_held, what.success_key, what.success_reward)
         mode = dict(autoreset_mode=AutoresetMode.DISABLED)  # an episode that has reached its goal is to end, though its environment does not say so
         if env.vectorization == "async":
             # A fork of a process in which JAX runs threads may hang, so the processes are started afresh.

@@ -76,7 +76,7 @@ def steps_to_learn(env: Environment, config: TrainConfig) -> int:
     Raises:
       UserError: if nothing is.
     """
-    at_random = warm_up_iterations(env, config) * config.num_envs if config.learns_from_rollouts else 0
+    at_random = warm_up_iterations(env, config) * config.steps_per_iteration if config.learns_from_rollouts else 0
     if config.steps <= at_random:
         raise UserError(f"steps = {config.steps} ends within the {at_random} random steps before learning: raise steps")
     return config.steps - at_random

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -12,15 +13,19 @@ import numpy as np
 
 from hindrl_jax.base.environments import Environment, can_step
 from hindrl_jax.base.errors import UserError
-from hindrl_jax.base.types import Array, Episodes
+from hindrl_jax.base.types import Episodes
 from hindrl_jax.config import TrainConfig
-from hindrl_jax.core.agent import policy
+from hindrl_jax.core.agent import Policy, policy
+from hindrl_jax.core.holding import hold, hold_demonstrations, longest_hold
 from hindrl_jax.core.rollout import Evaluation
 from hindrl_jax.training.checks import check_config, check_seeds, check_trainable, configs_per_seed, demonstrations_per_seed
 from hindrl_jax.training.devices import gather, spread
 from hindrl_jax.training.host import HostPrograms
 from hindrl_jax.training.programs import FRESH_EPISODES, JaxPrograms, Programs
 from hindrl_jax.training.result import Result, Row
+from hindrl_jax.training.selection import choose, keep, nothing_kept
+
+Report = Callable[[Result], Any]
 
 
 class Diverged(UserError):
@@ -33,7 +38,7 @@ def fit(
     config: TrainConfig | Sequence[TrainConfig],
     *,
     seeds: Sequence[int] = (0,),
-    report: Callable[[Result], None] = lambda result: None,
+    report: Report = lambda result: None,
     restore: Callable[[Result], Result | None] = lambda begun: None,
 ) -> Result:
     """Trains one policy per seed, all of them side by side in one compiled program.
@@ -46,14 +51,16 @@ def fit(
       demonstrations: one table for all seeds, or one table per seed (with equal numbers of demonstrations).
       config: for example from `preset`; one for all seeds, or one per seed. They may differ in the fields of `config.SWEEPABLE`.
       seeds: non-negative integers. A seed gives the same run whatever the others are, up to floating-point rounding.
-      report: called after compilation, several times between evaluations, after each evaluation, and at the end.
+      report: called after compilation, several times between evaluations, after each evaluation, and at the end. Where it returns something true
+        while the experiment learns, that ends: what was found so far is returned as ever.
       restore: called before anything is computed with a result whose guidance, state and key are `jax.ShapeDtypeStruct`s. Where it returns
         what `report` was given at some time in an earlier call with the same arguments, the experiment goes on from there, and all that
         follows is the same, bit for bit; see `hindrl_jax.runs.checkpoints`. Where it returns None, the experiment begins. In environments that
         are stepped outside JAX the episodes under way are lost, so there what follows is another experiment, as good as the first.
 
     Returns:
-      The finished experiment. With several hosts, its agents are gathered on each of them, and the replay is not.
+      The finished experiment: for each seed the best policy that was seen, `returned`, and in `state` the last one. With several hosts, its agents
+      are gathered on each of them, and the replay is not.
 
     Raises:
       UserError: if the config does not fit the environment, or the environment cannot be trained in, or the experiment does not fit into the
@@ -63,7 +70,7 @@ def fit(
     check_trainable(env)
     check_seeds(seeds)
     tables = demonstrations_per_seed(demonstrations, seeds, env)
-    configs = configs_per_seed(config, seeds)
+    configs = tuple(with_action_hold(config, tables) for config in configs_per_seed(config, seeds))
     config = configs[0]
     check_config(env, config)
     if config.quirks.misaligned_demo_actions and int(tables.lengths.min()) < 2:
@@ -71,9 +78,12 @@ def fit(
     if config.demo_reset_ratio == 0.0:
         tables = tables.replace(states=None)  # nobody needs them on the devices
 
+    num_held = int(config.action_hold or 1)
+    tables = hold_demonstrations(tables, num_held)
     started = time.perf_counter()
-    with contextlib.closing(programs_of(env, configs, tables)) as programs:
-        result = Result(env=env, configs=configs, seeds=tuple(seeds), **programs.shapes, rows=[], compile_seconds=0.0)
+    with contextlib.closing(programs_of(hold(env, num_held), configs, tables)) as programs:
+        kept = nothing_kept(programs.shapes["state"].agent.average_actor)
+        result = Result(env=env, configs=configs, seeds=tuple(seeds), **programs.shapes, kept=kept, rows=[], compile_seconds=0.0)
         restored = restore(result)
         seeds_on_devices, tables = spread((np.asarray(seeds, np.uint32), tables), programs.mesh)
         if restored is None:
@@ -85,6 +95,13 @@ def fit(
         _train(result, programs, report)
     report(result)
     return result
+
+
+def with_action_hold(config: TrainConfig, demonstrations: Episodes) -> TrainConfig:
+    """The config with its `action_hold` chosen, if it is None: one for all seeds, from the median over all their demonstrations."""
+    if config.action_hold is not None:
+        return config
+    return dataclasses.replace(config, action_hold=longest_hold(np.asarray(demonstrations.lengths)))
 
 
 def programs_of(env: Environment, configs: Sequence[TrainConfig], demonstrations: Episodes) -> Programs:
@@ -102,9 +119,9 @@ def programs_of(env: Environment, configs: Sequence[TrainConfig], demonstrations
     return programs(env, configs, demonstrations)
 
 
-def _train(result: Result, programs: Programs, report: Callable[[Result], None]) -> None:
+def _train(result: Result, programs: Programs, report: Report) -> None:
     """Takes the experiment from where it is to its end, all but the last report."""
-    config, num_seeds, begins = result.config, len(result.seeds), result.steps_done == 0
+    config, begins = result.config, result.steps_done == 0
     started = time.perf_counter() - result.train_seconds
     if begins and config.learns_from_rollouts:
         result.state = jax.block_until_ready(programs.collect(result.state, result.guidance))
@@ -112,36 +129,65 @@ def _train(result: Result, programs: Programs, report: Callable[[Result], None])
         if config.bc_warm_start > 0:
             result.state = jax.block_until_ready(programs.warm_start(result.state, result.guidance))
             result.updates = config.bc_warm_start
-    while result.steps_done < config.steps:
+    ends = result.kept.all_confirmed
+    while result.steps_done < config.steps and not ends:
         result.state, metrics = programs.learn(result.state, result.guidance)
         result.chunks.append(gather(metrics))
         if config.learns_from_rollouts:
-            result.env_steps += programs.chunk * config.num_envs
+            result.env_steps += programs.chunk * config.steps_per_iteration
             result.updates += programs.chunk * config.updates_per_iteration
         else:
             result.updates += programs.chunk
         _check_finite(result)
-        evaluations_done = len(result.rows) // num_seeds
+        evaluations_done = len(result.rows) // len(result.seeds)
         if result.steps_done >= min(programs.steps_at_random + (evaluations_done + 1) * config.eval_every, config.steps):
-            result.key, evaluation = _evaluated(result, programs, config.eval_episodes)
-            result.train_seconds = time.perf_counter() - started
-            averaged = {name: np.mean([chunk[name] for chunk in result.chunks], axis=0) for name in result.chunks[0]}
-            result.rows += _rows(result, evaluation, averaged)
-            result.chunks.clear()
+            _evaluate(result, programs, started)
         result.train_seconds = time.perf_counter() - started
-        report(result)
+        asked = bool(report(result))
+        ends = asked or result.kept.all_confirmed
+    if not result.rows:  # ended by `report` before the first evaluation
+        _evaluate(result, programs, started)
+    _finish(result, programs)
 
-    _, fresh = _evaluated(result, programs, FRESH_EPISODES)
-    result.final_success, result.final_length = fresh.success.mean(axis=1), fresh.length.mean(axis=1)
+
+def _evaluate(result: Result, programs: Programs, started: float) -> None:
+    """Evaluates the present policies, notes it, and keeps those that are good."""
+    agent, stop_at = result.state.agent, result.config.stop_at
+    evaluation = _played(result, programs, policy(agent, average=True), result.config.eval_episodes)
+    result.train_seconds = time.perf_counter() - started
+    averaged = {name: np.mean([chunk[name] for chunk in result.chunks], axis=0) for name in result.chunks[0]} if result.chunks else {}
+    result.rows += _rows(result, evaluation, averaged)
+    result.chunks.clear()
+    confirmed = np.zeros(len(result.seeds), bool)
+    if stop_at is not None:
+        confirmed = (evaluation.success.mean(axis=1) >= stop_at) & (result.kept.confirmed < 0)
+        if confirmed.any():
+            confirmed &= _played(result, programs, policy(agent, average=True), FRESH_EPISODES).success.mean(axis=1) >= stop_at
+    result.kept = keep(result.kept, gather(agent.average_actor), evaluation, confirmed, result.moment)
+
+
+def _finish(result: Result, programs: Programs) -> None:
+    """Chooses the policies that are returned."""
+    scale = result.state.agent.scale
+
+    def play(actor: Any) -> Evaluation:
+        return _played(result, programs, Policy(actor=spread(actor, programs.mesh), scale=scale), FRESH_EPISODES)
+
+    result.returned, last = choose(result.kept, gather(result.state.agent.average_actor), result.moment, play)
+    result.final_success, result.final_length = (np.asarray(outcome).mean(axis=1) for outcome in (last.success, last.length))
     if jax.process_count() > 1:
         result.guidance, agent = gather((result.guidance, result.state.agent))
         result.state = result.state.replace(agent=agent)
 
 
-def _evaluated(result: Result, programs: Programs, num_episodes: int) -> tuple[Array, Any]:
-    """The keys of later evaluations, and what became of fresh episodes, numpy leaves (S, num_episodes)."""
-    key, evaluation = programs.evaluate(result.key, policy(result.state.agent, average=True), result.guidance, num_episodes)
-    return key, gather(evaluation)
+def _played(result: Result, programs: Programs, policies: Policy, num_episodes: int) -> Evaluation:
+    """What became of fresh episodes, numpy leaves (S, num_episodes), lengths in environment steps; they are counted."""
+    result.key, evaluation = programs.evaluate(result.key, policies, result.guidance, num_episodes)
+    evaluation = gather(evaluation)
+    evaluation = evaluation.replace(length=evaluation.length * (result.config.action_hold or 1))
+    before = 0 if result.evaluation_steps is None else result.evaluation_steps
+    result.evaluation_steps = before + np.asarray(evaluation.length).sum(axis=1, dtype=np.int64)
+    return evaluation
 
 
 def _check_finite(result: Result) -> None:

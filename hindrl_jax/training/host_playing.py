@@ -124,7 +124,7 @@ def play(stepper: Stepper, seeds: np.ndarray, act: HostAct, num_episodes: int) -
     return success, length
 
 
-def film(stepper: WatchedStepper, seed: int, act: HostAct, behavioural_goal: np.ndarray) -> tuple[list[np.ndarray], bool]:
+def film(stepper: WatchedStepper, seed: int, act: HostAct, behavioural_goal: np.ndarray, num_held: int = 1) -> tuple[list[np.ndarray], bool]:
     """Plays one episode: a picture (H, W, 3) uint8 of each state, and whether the task was solved.
 
     Args:
@@ -132,6 +132,7 @@ def film(stepper: WatchedStepper, seed: int, act: HostAct, behavioural_goal: np.
       seed: which episode.
       act: the policy.
       behavioural_goal: (1, G), in the place of a goal of the episode's own where it has none.
+      num_held: steps for which each action is held.
 
     Raises:
       UserError: if the environment draws no pictures.
@@ -139,8 +140,10 @@ def film(stepper: WatchedStepper, seed: int, act: HostAct, behavioural_goal: np.
     observation, goal = stepper.begin(np.array([seed]))
     pictures = [stepper.picture()]
     while True:
-        outcome = stepper.step(act(observation, behavioural_goal if goal is None else goal), begin_anew=False)
-        pictures.append(stepper.picture())
-        if outcome.ended[0]:
-            return pictures, bool(outcome.success[0])
+        action = act(observation, behavioural_goal if goal is None else goal)
+        for _ in range(num_held):
+            outcome = stepper.step(action, begin_anew=False)
+            pictures.append(stepper.picture())
+            if outcome.ended[0]:
+                return pictures, bool(outcome.success[0])
         observation, goal = outcome.observation, outcome.desired_goal

@@ -19,6 +19,7 @@ from hindrl_jax.config import TrainConfig
 from hindrl_jax.core import rollout
 from hindrl_jax.core.agent import Policy
 from hindrl_jax.core.goals import GoalTable, sample_goals
+from hindrl_jax.core.holding import hold
 from hindrl_jax.core.rollout import Evaluation
 from hindrl_jax.core.train import make_policy
 from hindrl_jax.tasks.registry import Act, task
@@ -26,7 +27,7 @@ from hindrl_jax.training import host_playing
 from hindrl_jax.training.devices import seed_mesh
 
 
-def play(key: Array, env: RestorableEnvironment, act: Act, num_episodes: int) -> Episodes:
+def play(key: Array, env: RestorableEnvironment, act: Act, num_episodes: int, num_held: int = 1) -> Episodes:
     """Plays episodes to their end, solved or not, and notes the states on the way, which are repeated after the end.
 
     The desired goal of an episode is the goal that it reached at its end.
@@ -36,24 +37,27 @@ def play(key: Array, env: RestorableEnvironment, act: Act, num_episodes: int) ->
       env: static.
       act: the policy.
       num_episodes: N, played side by side.
+      num_held: steps for which each action is held.
     """
 
-    def step(carry: tuple[Array, Any, Array, Array], _: None) -> tuple[tuple[Array, Any, Array, Array], tuple[Array, ...]]:
-        key, state, observation, over = carry
+    def step(carry: tuple[Array, Any, Array, Array, Array], index: Array) -> tuple[tuple[Array, Any, Array, Array, Array], tuple[Array, ...]]:
+        key, state, observation, over, held = carry
         key, key_act = jax.random.split(key)
         action = act(key_act, state, observation)
+        if num_held > 1:
+            action = jnp.where(index % num_held == 0, action, held)
         next_state, time_step = env.step(state, action)
         next_state = tree_where(over, state, next_state)
         next_observation = jnp.where(over, observation, time_step.observation)
         done = jnp.clip(action_from_env(action, env), -1.0, 1.0)  # what the environment makes of an action beyond its bounds
         row = (observation, env.state_to_vector(state), done, time_step.reward, over, time_step.terminated)
-        return (key, next_state, next_observation, over | time_step.terminated | time_step.truncated), row
+        return (key, next_state, next_observation, over | time_step.terminated | time_step.truncated, action), row
 
     def episode(key: Array) -> Episodes:
         key_reset, key_play = jax.random.split(key)
         state, observation = env.reset(key_reset)
-        start = (key_play, state, observation, jnp.asarray(False))
-        (_, state, observation, _), rows = jax.lax.scan(step, start, length=env.horizon)
+        start = (key_play, state, observation, jnp.asarray(False), jnp.zeros(env.action_dim))
+        (_, state, observation, _, _), rows = jax.lax.scan(step, start, jnp.arange(env.horizon))
         observations, states, actions, rewards, over, terminated = rows
         return Episodes(
             observations=jnp.concatenate([observations, observation[None]]),
@@ -73,22 +77,22 @@ def plays_one_by_one(env: Environment) -> bool:
     return not can_step(env) and not can_step_on_host(env)
 
 
-def player(env: Environment, act: Act, num_episodes: int) -> Callable[[Array], Episodes]:
+def player(env: Environment, act: Act, num_episodes: int, num_held: int = 1) -> Callable[[Array], Episodes]:
     """`play` as a program, key -> episodes, on whatever steps the environment. It is compiled once.
 
     Args:
-      env, act, num_episodes: as for `play`.
+      env, act, num_episodes, num_held: as for `play`.
 
     Raises:
       UserError: if nothing plays episodes of this environment with their states; from the program, if its back end is missing or unusable.
     """
     if can_step(env):
         steppable: Any = env
-        return jax.jit(lambda key: play(key, steppable, act, num_episodes), compiler_options=compiler_options(env))
+        return jax.jit(lambda key: play(key, steppable, act, num_episodes, num_held), compiler_options=compiler_options(env))
     play_one_by_one = task(env.name).player
     if play_one_by_one is None:
         raise UserError(f"{env.name} cannot be played with its states: it has no step in JAX")
-    return lambda key: play_one_by_one(key, env, act, num_episodes)
+    return lambda key: play_one_by_one(key, env, act, num_episodes, num_held)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,6 +108,11 @@ class TrainedPolicies:
     stochastic: bool = False
     """Sample the actions, instead of taking the mean ones."""
 
+    @property
+    def num_held(self) -> int:
+        """Steps for which each action is held."""
+        return self.config.action_hold or 1
+
     def evaluate(self, keys: Array, num_episodes: int, report: Callable[[int], None] = lambda played: None) -> Evaluation:
         """Plays fresh episodes with each policy; leaves (S, num_episodes).
 
@@ -112,10 +121,11 @@ class TrainedPolicies:
           num_episodes: of each policy.
           report: called with the number of episodes played so far, all policies together, where they are played one by one.
         """
-        if can_step(self.env):
-            return self._evaluate_in_jax(self.env, keys, num_episodes)
-        if can_step_on_host(self.env):
-            return self._evaluate_on_host(self.env, keys, num_episodes)
+        env = hold(self.env, self.num_held)
+        if can_step(env):
+            return self._in_steps(self._evaluate_in_jax(env, keys, num_episodes))
+        if can_step_on_host(env):
+            return self._in_steps(self._evaluate_on_host(env, keys, num_episodes))
         return self._evaluate_one_by_one(keys, num_episodes, report)
 
     def play(self, key: Array, index: int, num_episodes: int) -> Episodes:
@@ -137,7 +147,7 @@ class TrainedPolicies:
             goal = sample_goals(jax.random.fold_in(state.key, 0), goals, 1) if any_goal else goals.goals[:1]
             return action_to_env(choose(key, observation[None], goal)[0], env)
 
-        return player(env, act, num_episodes)
+        return player(env, act, num_episodes, self.num_held)
 
     def film(self, keys: Array, index: int) -> tuple[list[np.ndarray], int]:
         """Plays episodes in an environment that draws itself: pictures (H, W, 3) uint8 of all states, and how many episodes are solved.
@@ -158,10 +168,14 @@ class TrainedPolicies:
             key_seed, key_act = jax.random.split(key)
             act = host_policies.acting(key_act[None], policy)
             with contextlib.closing(self.env.watched(with_pictures=True)) as stepper:
-                episode, solved = host_playing.film(stepper, int(jax.random.bits(key_seed)), act, first_goal)
+                episode, solved = host_playing.film(stepper, int(jax.random.bits(key_seed)), act, first_goal, self.num_held)
             pictures += episode
             num_solved += solved
         return pictures, num_solved
+
+    def _in_steps(self, evaluation: Evaluation) -> Evaluation:
+        """Lengths in steps of the environment, from lengths in decisions."""
+        return evaluation.replace(length=evaluation.length * self.num_held)
 
     def _evaluate_in_jax(self, env: Steppable, keys: Array, num_episodes: int) -> Evaluation:
         """All episodes of all policies in one compiled program."""

@@ -66,7 +66,7 @@ class Programs(abc.ABC):
         """
         self.env, self.config, num_seeds = env, configs[0], len(configs)
         self.warm_up, self.chunk = extent(env, self.config)
-        self.steps_at_random = self.warm_up * self.config.num_envs
+        self.steps_at_random = self.warm_up * self.config.steps_per_iteration
         self.mesh = seed_mesh(num_seeds)
         values = {name: np.asarray([sweepable_value(config, name) for config in configs], np.float32) for name in swept_fields(configs)}
         self._compile(shapes_on((jax.ShapeDtypeStruct((num_seeds,), np.uint32), demonstrations), self.mesh), shapes_on(values, self.mesh))
@@ -182,7 +182,7 @@ def extent(env: Environment, config: TrainConfig) -> tuple[int, int]:
     Raises:
       UserError: if nothing is left to learn in.
     """
-    warm_up, per_iteration = (training.warm_up_iterations(env, config), config.num_envs) if config.learns_from_rollouts else (0, 1)
+    warm_up, per_iteration = (training.warm_up_iterations(env, config), config.steps_per_iteration) if config.learns_from_rollouts else (0, 1)
     return warm_up, max(1, min(config.eval_every // CHUNKS_PER_EVALUATION, steps_to_learn(env, config)) // per_iteration)
 
 

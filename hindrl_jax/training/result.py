@@ -12,6 +12,7 @@ from hindrl_jax.base.types import Array
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.core.guidance import Guidance
 from hindrl_jax.core.train import TrainState
+from hindrl_jax.training.selection import Kept, Moment, Returned
 
 SOLVED = 0.95
 """Share of an evaluation's episodes from which on a task counts as learned."""
@@ -39,8 +40,16 @@ class SeedSummary:
     """What became of one seed. The threshold of 95% refers to the evaluations along the run; None where it was never reached."""
 
     seed: int
+    returned_success: float
+    """Share of 100 fresh episodes, others than those that chose it, that the returned policy solves: the best that the run has seen."""
+    returned_length: float
+    """Mean length of those episodes."""
+    returned_env_steps: int
+    """Environment steps after which the returned policy was seen."""
+    returned_updates: int
+    returned_seconds: float
     final_success: float
-    """Share of 100 fresh episodes that the final policy solves."""
+    """Share of 100 fresh episodes that the last policy solves."""
     best_success: float
     """The best evaluation, the final one included."""
     env_steps_to_95: int | None
@@ -48,7 +57,9 @@ class SeedSummary:
     seconds_to_95: float | None
     """Wall-clock time of the whole run, all its seeds side by side."""
     episode_length: float
-    """Mean length of the 100 fresh episodes."""
+    """Mean length of the 100 fresh episodes of the last policy."""
+    evaluation_steps: int
+    """Environment steps that evaluations and the choice of the returned policy took; `env_steps` does not count them."""
 
 
 @dataclasses.dataclass
@@ -63,7 +74,9 @@ class Result:
     guidance: Guidance
     """Leaves (S, ...)."""
     state: TrainState
-    """Leaves (S, ...); the policies' parameters are `state.agent.average_actor`. While the run is under way the next chunk consumes it."""
+    """Leaves (S, ...); the last policies' parameters are `state.agent.average_actor`. While the run is under way the next chunk consumes it."""
+    kept: Kept
+    """The policies of the best evaluations so far."""
     rows: list[Row]
     """In order of time, S rows per evaluation, in order of the runs."""
     compile_seconds: float
@@ -73,10 +86,14 @@ class Result:
     """Environment steps of each run so far."""
     updates: int = 0
     """Gradient steps of each run so far."""
+    evaluation_steps: np.ndarray | None = None
+    """(S,) int, environment steps that evaluations took so far; None before the first."""
+    returned: Returned | None = None
+    """The best policy of each run; None while the experiment is under way."""
     final_success: np.ndarray | None = None
-    """(S,) share of 100 fresh episodes that the final policies solve; None while the run is under way."""
+    """(S,) share of 100 fresh episodes that the last policies solve; None while the experiment is under way."""
     final_length: np.ndarray | None = None
-    """(S,) mean length of those episodes."""
+    """(S,) mean length of those episodes, in environment steps."""
     key: Array | None = None
     """(S,) keys of the evaluations to come."""
     chunks: list[dict[str, np.ndarray]] = dataclasses.field(default_factory=list)
@@ -91,6 +108,11 @@ class Result:
     def steps_done(self) -> int:
         """What `TrainConfig.steps` counts: environment steps of each run so far; for behaviour cloning, gradient steps."""
         return self.env_steps if self.config.learns_from_rollouts else self.updates
+
+    @property
+    def moment(self) -> Moment:
+        """How far the experiment is."""
+        return Moment(self.env_steps, self.updates, self.train_seconds)
 
     def latest_success(self) -> float | None:
         """Success of the newest evaluation, averaged over runs; None before the first."""
@@ -115,6 +137,9 @@ class Result:
             guidance=guidance,
             state=self.state.replace(agent=agent),
             rows=self.rows_of(runs),
+            kept=jax.tree.map(lambda leaf: leaf[runs], self.kept),
+            returned=jax.tree.map(lambda leaf: leaf[runs], self.returned),
+            evaluation_steps=self.evaluation_steps[runs],
             final_success=self.final_success[runs],
             final_length=self.final_length[runs],
         )
@@ -124,10 +149,16 @@ class Result:
         first = next((row for row in rows if row.success >= SOLVED), None)
         return SeedSummary(
             seed=seed,
+            returned_success=float(self.returned.success[index]),
+            returned_length=float(self.returned.length[index]),
+            returned_env_steps=int(self.returned.env_steps[index]),
+            returned_updates=int(self.returned.updates[index]),
+            returned_seconds=float(self.returned.seconds[index]),
             final_success=float(self.final_success[index]),
             best_success=max(float(self.final_success[index]), *(row.success for row in rows)),
             env_steps_to_95=None if first is None else first.env_steps,
             updates_to_95=None if first is None else first.updates,
             seconds_to_95=None if first is None else first.seconds,
             episode_length=float(self.final_length[index]),
+            evaluation_steps=int(self.evaluation_steps[index]),
         )

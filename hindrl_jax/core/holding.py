@@ -1,0 +1,124 @@
+"""Held actions: one decision of the policy is the command of several control steps.
+
+What makes a sparse-reward task long is the number of decisions between start and reward, over which the value has to travel. With each action held
+for k control steps there are k times fewer. The task stays what it is: its horizon and its demonstrations count control steps, and the
+environment notices what it notices at each of them. Training, evaluation and saved policies see `hold(env, k)`, one step of which is one decision.
+(Action repeat is as old as the Atari benchmark, Bellemare et al., 2013; chunks of actions, Li et al., 2025, are its general form.)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hindrl_jax.base.environments import Environment
+from hindrl_jax.base.types import Array, Episodes, TimeStep, tree_where
+
+FEWEST_DECISIONS = 60
+"""Decisions that the median demonstration still takes when its actions are held for as long as can be."""
+
+
+@dataclasses.dataclass(frozen=True)
+class HeldActions:
+    """An environment whose actions are held, made by `hold`. It is able to do whatever the environment is, which answers for all else."""
+
+    env: Any
+    num_held: int
+    """k, control steps for each action."""
+
+    @property
+    def horizon(self) -> int:
+        """In decisions, the last of which may be cut short."""
+        return -(-self.env.horizon // self.num_held)
+
+
+def hold(env: Environment, num_held: int) -> Environment:
+    """The environment with each action held for `num_held` control steps, or until the episode is over; itself for 1."""
+    return env if num_held == 1 else _held_class(type(env))(env, num_held)
+
+
+@functools.cache
+def _held_class(kind: type[Any]) -> type[Any]:
+    """`HeldActions` with all public attributes of a class of environments, so that abilities can be asked for as ever."""
+    own = {"reset": _delegated("reset"), "step": _step, "stepper": _stepper}
+    names = {name for name in (*dir(kind), *(field.name for field in dataclasses.fields(kind))) if not name.startswith("_")}
+    members = {name: own.get(name) or _delegated(name) for name in names if name not in ("horizon", "watched")}
+    return type("HeldActions", (HeldActions,), members)
+
+
+def _delegated(name: str) -> property:
+    return property(lambda held: getattr(held.env, name))
+
+
+def _step(held: HeldActions, state: Any, action: Array) -> tuple[Any, TimeStep]:
+    """`num_held` control steps with the same action, as one; what comes after the end of the episode does not happen."""
+
+    def control_step(carry: tuple[Any, TimeStep], _: None) -> tuple[tuple[Any, TimeStep], None]:
+        state, before = carry
+        over = before.terminated | before.truncated
+        after, time_step = held.env.step(state, action)
+        time_step = time_step.replace(reward=before.reward + time_step.reward)
+        return tree_where(over, carry, (after, time_step)), None
+
+    nothing = TimeStep(
+        observation=jnp.zeros(held.env.observation_dim),
+        reward=jnp.zeros(()),
+        terminated=jnp.asarray(False),
+        truncated=jnp.asarray(False),
+    )
+    return jax.lax.scan(control_step, (state, nothing), length=held.num_held)[0]
+
+
+def _stepper(held: HeldActions, num_envs: int) -> Any:
+    return held.env.stepper(num_envs, num_held=held.num_held)
+
+
+def longest_hold(lengths: np.ndarray) -> int:
+    """For how many control steps actions can be held: the most with which the median demonstration takes `FEWEST_DECISIONS`, at least 1.
+
+    Args:
+      lengths: of the demonstrations, in control steps, any shape.
+    """
+    return max(1, int(np.median(lengths)) // FEWEST_DECISIONS)
+
+
+def hold_demonstrations(demonstrations: Episodes, num_held: int) -> Episodes:
+    """Demonstrations as `hold` would have shown them: every k-th state and the last one, and between them the mean of the actions.
+
+    The mean of commands to move is the command that, held, moves as far. Where the motion is finer than k steps, the demonstrated
+    actions are blurred.
+
+    Args:
+      demonstrations: N of T control steps, numpy or JAX, leaves (..., N, ...).
+      num_held: k.
+
+    Returns:
+      Numpy leaves, the same but for T, which counts decisions.
+    """
+    if num_held == 1:
+        return demonstrations
+    lengths = np.asarray(demonstrations.lengths)
+    horizon = -(-demonstrations.actions.shape[-2] // num_held)
+    starts = np.minimum(np.arange(horizon + 1) * num_held, lengths[..., None])  # (..., N, decisions + 1), control steps
+
+    def at_decisions(values: Any) -> np.ndarray:
+        return np.take_along_axis(np.asarray(values), starts[..., None], axis=-2)
+
+    def sums(values: Any) -> np.ndarray:
+        """(..., N, T, X) -> (..., N, decisions, X), over the control steps of each decision."""
+        values = np.asarray(values)
+        so_far = np.concatenate([np.zeros_like(values[..., :1, :]), np.cumsum(values, axis=-2, dtype=np.float64)], axis=-2)
+        return np.diff(np.take_along_axis(so_far, starts[..., None], axis=-2), axis=-2).astype(np.float32)
+
+    return demonstrations.replace(
+        observations=at_decisions(demonstrations.observations),
+        actions=sums(demonstrations.actions) / np.maximum(np.diff(starts, axis=-1), 1)[..., None],
+        rewards=sums(np.asarray(demonstrations.rewards)[..., None])[..., 0],
+        lengths=-(-lengths // num_held),
+        states=None if demonstrations.states is None else at_decisions(demonstrations.states),
+    )

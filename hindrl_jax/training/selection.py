@@ -1,0 +1,151 @@
+"""The policies of a run that are worth keeping, and which of them is returned.
+
+An evaluation is noisy, and learning goes up and down: neither the last policy nor the one of the best evaluation is the best that a run has found. So
+the policies of the best evaluations are kept. In the end they and the last one play fresh episodes, which decides; and what is reported of the
+one that is returned comes from other episodes, so that the choice does not flatter it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from flax import struct
+
+from hindrl_jax.core.rollout import Evaluation
+
+NUM_KEPT = 4
+"""Policies that are kept along a run."""
+CHOICE_ROUNDS = 2
+"""Fresh evaluations of each of them, and of the last one, which decide in the end."""
+Play = Callable[[Any], Evaluation]
+"""Parameters of S actors -> what became of fresh episodes, numpy leaves (S, episodes); other ones at each call."""
+
+
+class Moment(NamedTuple):
+    """How far an experiment is."""
+
+    env_steps: int
+    updates: int
+    seconds: float
+
+
+class Kept(struct.PyTreeNode, kw_only=True):
+    """The policies of the best evaluations so far, numpy leaves. S runs, K policies of each, in no order."""
+
+    actor: Any  # parameters (S, K, ...)
+    success: np.ndarray  # (S, K) of their evaluations; -1 where there is none yet
+    length: np.ndarray  # (S, K) mean length of the episodes, in environment steps
+    env_steps: np.ndarray  # (S, K) int, environment steps when they were evaluated
+    updates: np.ndarray  # (S, K) int, gradient steps
+    seconds: np.ndarray  # (S, K) wall-clock training time of the whole experiment
+    confirmed: np.ndarray  # (S,) int, which of them ended its run (`TrainConfig.stop_at`); -1 for none
+
+    @property
+    def all_confirmed(self) -> bool:
+        """Whether every run has a policy with which it may end."""
+        return bool((self.confirmed >= 0).all())
+
+
+def nothing_kept(actor: Any) -> Kept:
+    """Before the first evaluation; `actor`: shapes (S, ...)."""
+    num_runs = jax.tree.leaves(actor)[0].shape[0]
+    shape = (num_runs, NUM_KEPT)
+    return Kept(
+        actor=jax.tree.map(lambda leaf: np.zeros((*shape, *leaf.shape[1:]), leaf.dtype), actor),
+        success=np.full(shape, -1.0),
+        length=np.zeros(shape),
+        env_steps=np.zeros(shape, np.int64),
+        updates=np.zeros(shape, np.int64),
+        seconds=np.zeros(shape),
+        confirmed=np.full(num_runs, -1),
+    )
+
+
+def keep(kept: Kept, actor: Any, evaluation: Evaluation, confirmed: np.ndarray, moment: Moment) -> Kept:
+    """Keeps each run's policy in place of the worst one kept, if it is as good or confirmed. Runs that have one confirmed are over.
+
+    Args:
+      kept: so far.
+      actor: parameters, numpy (S, ...).
+      evaluation: numpy (S, episodes).
+      confirmed: (S,) bool, whose policy ends its run.
+      moment: when.
+    """
+    runs, success, length = np.arange(len(confirmed)), evaluation.success.mean(axis=1), evaluation.length.mean(axis=1)
+    worst = np.lexsort((-kept.length, kept.success), axis=1)[:, 0]
+    than = kept.success[runs, worst], kept.length[runs, worst]
+    as_good = (success > than[0]) | ((success == than[0]) & (length <= than[1]))
+    taken = (kept.confirmed < 0) & (as_good | confirmed)
+    where = runs[taken], worst[taken]
+
+    def replaced(before: np.ndarray, values: Any) -> np.ndarray:
+        after = before.copy()
+        after[where] = np.broadcast_to(values, (len(runs), *before.shape[2:]))[taken]
+        return after
+
+    return Kept(
+        actor=jax.tree.map(replaced, kept.actor, actor),
+        success=replaced(kept.success, success),
+        length=replaced(kept.length, length),
+        env_steps=replaced(kept.env_steps, moment.env_steps),
+        updates=replaced(kept.updates, moment.updates),
+        seconds=replaced(kept.seconds, moment.seconds),
+        confirmed=np.where(taken & confirmed, worst, kept.confirmed),
+    )
+
+
+class Returned(struct.PyTreeNode, kw_only=True):
+    """The policy that each of S runs returns, numpy leaves."""
+
+    actor: Any  # parameters (S, ...)
+    success: np.ndarray  # (S,) share of fresh episodes that it solves, others than those that chose it
+    length: np.ndarray  # (S,) mean length of those episodes, in environment steps
+    env_steps: np.ndarray  # (S,) int, when it was evaluated
+    updates: np.ndarray  # (S,) int
+    seconds: np.ndarray  # (S,) wall-clock training time of the whole experiment
+
+
+def choose(kept: Kept, last: Any, now: Moment, play: Play) -> tuple[Returned, Evaluation]:
+    """Lets the kept policies and the last ones play, and returns each run's best, and what became of the last one's episodes.
+
+    A confirmed policy is chosen already. Of equals the one that takes fewer steps is chosen.
+
+    Args:
+      kept: of S runs.
+      last: parameters of the last policies, numpy (S, ...).
+      now: of the last policies.
+      play: plays fresh episodes with S policies.
+    """
+    runs = np.arange(len(kept.confirmed))
+    candidates = [jax.tree.map(lambda leaf, k=k: leaf[:, k], kept.actor) for k in range(NUM_KEPT)] + [last]
+    if kept.all_confirmed:
+        chosen = kept.confirmed
+    else:
+        scores = np.stack([_score(actor, play) for actor in candidates], axis=1)  # (S, K + 1)
+        scores[:, :NUM_KEPT][kept.success < 0.0] = -np.inf
+        chosen = np.where(kept.confirmed >= 0, kept.confirmed, np.argmax(scores, axis=1))
+
+    def of_chosen(values: np.ndarray, value_now: float) -> np.ndarray:
+        return np.concatenate([values, np.full((len(values), 1), value_now, values.dtype)], axis=1)[runs, chosen]
+
+    actor = jax.tree.map(lambda *leaves: np.stack(leaves, axis=1)[runs, chosen], *candidates)
+    fresh, fresh_of_last = play(actor), play(last)
+    returned = Returned(
+        actor=actor,
+        success=np.asarray(fresh.success).mean(axis=1),
+        length=np.asarray(fresh.length).mean(axis=1),
+        env_steps=of_chosen(kept.env_steps, now.env_steps),
+        updates=of_chosen(kept.updates, now.updates),
+        seconds=of_chosen(kept.seconds, now.seconds),
+    )
+    return returned, fresh_of_last
+
+
+def _score(actor: Any, play: Play) -> np.ndarray:
+    """(S,) successful episodes, and between equal numbers of them the fewer steps."""
+    rounds = [play(actor) for _ in range(CHOICE_ROUNDS)]
+    success, length = (np.concatenate([getattr(evaluation, name) for evaluation in rounds], axis=1) for name in ("success", "length"))
+    return success.sum(axis=1) - length.mean(axis=1) / (1.0 + length.max())
