@@ -160,9 +160,10 @@ def _evaluate(result: Result, programs: Programs, started: float) -> None:
     result.chunks.clear()
     confirmed = np.zeros(len(result.seeds), bool)
     if stop_at is not None:
-        confirmed = (evaluation.success.mean(axis=1) >= stop_at) & (result.kept.confirmed < 0)
+        confirmed = (np.asarray(evaluation.success).mean(axis=1) >= stop_at) & (result.kept.confirmed < 0)
         if confirmed.any():
-            confirmed &= _played(result, programs, policy(agent, average=True), FRESH_EPISODES).success.mean(axis=1) >= stop_at
+            again = _played(result, programs, policy(agent, average=True), FRESH_EPISODES)
+            confirmed &= np.asarray(again.success).mean(axis=1) >= stop_at
     result.kept = keep(result.kept, gather(agent.average_actor), evaluation, confirmed, result.moment)
 
 
