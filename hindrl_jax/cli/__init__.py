@@ -9,12 +9,12 @@ import os
 import sys
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import jax
 
 from hindrl_jax import __version__
+from hindrl_jax.base.compilation import keep_compiled_programs
 from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.cli import comparison, demonstrations, environments, inspection, playing, reproduction, sweeping, training
 from hindrl_jax.cli.signals import interrupts_that_last
@@ -63,15 +63,10 @@ def _find(arguments: list[str]) -> tuple[Command, list[str]]:
 def _set_up_jax() -> None:
     """Settings that the user should not have to know, unless set by the user.
 
-    Compiled programs are kept in the user's cache folder, so that a second start takes seconds. JAX_COMPILATION_CACHE_DIR names another folder,
-    JAX_ENABLE_COMPILATION_CACHE=false turns it off. Each core counts as a device, so that several seeds are spread over the cores:
-    a core is busier with a seed of its own than with its share of every operation. JAX_NUM_CPU_DEVICES=1 turns that off.
+    Compiled programs are kept (`keep_compiled_programs`). Each core counts as a device, so that several seeds are spread over the cores: a core is
+    busier with a seed of its own than with its share of every operation. JAX_NUM_CPU_DEVICES=1 turns that off.
     """
-    if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]  # defined while jax starts
-        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hindrl_jax"
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-    if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    keep_compiled_programs()
     if "JAX_NUM_CPU_DEVICES" not in os.environ and "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
         jax.config.update("jax_num_cpu_devices", cores or 1)

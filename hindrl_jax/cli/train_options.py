@@ -15,7 +15,7 @@ from hindrl_jax.cli.common import ENV_HELP, env_names, parse, peek, seeds_from
 from hindrl_jax.config import TrainConfig, without_effect
 from hindrl_jax.demonstrations.convert import MINARI_PREFIX
 from hindrl_jax.runs.spec import FROM_PYTHON, RunSpec, read_spec
-from hindrl_jax.tasks.presets import ORIGINAL_RULES, Preset, preset
+from hindrl_jax.tasks.presets import Preset, original_rules, preset
 from hindrl_jax.tasks.registry import make, task
 from hindrl_jax.training.checks import check_config, check_trainable
 
@@ -120,9 +120,7 @@ def _defaults(chosen: dict[str, Any]) -> RunSpec:
         return read_spec(Path(chosen["config"]))
     name = chosen["env"] or "FixedGridPickAndPlace"
     config = preset(chosen["algo"] or "hindrl", chosen["preset"] or "default", env=name)
-    env_arguments = ORIGINAL_RULES[task(name).family] if chosen["preset"] == "original" else {}
-    known = {field.name for field in dataclasses.fields(task(name).environment)}
-    env_arguments = {field: value for field, value in env_arguments.items() if field in known}  # a task of one's own need not have such rules
+    env_arguments = original_rules(task(name).environment) if chosen["preset"] == "original" else {}
     return RunSpec(env=make(name, **env_arguments), config=config, demos="1", seeds=(0,))
 
 

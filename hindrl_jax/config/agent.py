@@ -69,8 +69,8 @@ class AgentConfig:
     q_filter: bool = False
     """Clone only the demonstrated actions that the critics value above the policy's own (Nair et al., 2018, eq. 4)."""
     input_encoding: Literal["raw", "multiscale", "standardised"] = "multiscale"
-    """Networks see inputs as they are (thesis); x and tanh(4 x), x being the input over its root mean square in the demonstrations; or the input
-    less its mean there, over its standard deviation."""
+    """Networks see inputs as they are (thesis); or less their mean in the demonstrations, over their standard deviation; or (multiscale) that and
+    tanh(4 x), x being the input over its root mean square there."""
 
     def __post_init__(self) -> None:
         check_types(self)

@@ -12,6 +12,8 @@ from hindrl_jax.config.goal import GoalConfig
 from hindrl_jax.config.priority import PriorityConfig
 from hindrl_jax.config.quirks import QuirksConfig
 
+STEPS_PER_UPDATE = 4
+"""Control steps for each gradient step, where the config does not say how many of these there are."""
 Algorithm = Literal["bc", "tqcfd", "hindrl", "smooth-hindrl"]
 
 
@@ -28,8 +30,8 @@ class TrainConfig:
     action_hold: int | None = None
     """Control steps for which each action is held: one decision of the policy. Steps, horizon and episode lengths count control steps; epsilon_steps,
     n_step and gamma count decisions. None lets `fit` choose: as many as leave the median demonstration at least 60 decisions."""
-    updates_per_iteration: int = 2
-    """Gradient steps after each (vectorised) environment step."""
+    updates_per_iteration: int | None = None
+    """Gradient steps after each decision of all environments; None takes one for every 4 control steps."""
     learning_starts: int = 1_600
     """Environment steps with uniformly random actions before the first gradient step; at least one horizon in each environment is taken."""
     demo_reset_ratio: float = 0.0
@@ -65,10 +67,11 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         check_types(self)
-        counts = ("steps", "num_envs", "updates_per_iteration", "buffer_size", "eval_every", "eval_episodes")
+        counts = ("steps", "num_envs", "buffer_size", "eval_every", "eval_episodes")
         check(
             self,
             **{name: (getattr(self, name) >= 1, "at least 1") for name in counts},
+            updates_per_iteration=(self.updates_per_iteration is None or self.updates_per_iteration >= 1, "at least 1, or None"),
             action_hold=(self.action_hold is None or self.action_hold >= 1, "at least 1, or None"),
             stop_at=(self.stop_at is None or 0.0 < self.stop_at <= 1.0, "greater than 0 and at most 1, or None"),
             learning_starts=(self.learning_starts >= 0, "0 or more"),
@@ -102,9 +105,19 @@ class TrainConfig:
             )
 
     @property
+    def num_held(self) -> int:
+        """Control steps for which each action is held; 1 where nobody has chosen."""
+        return self.action_hold or 1
+
+    @property
     def steps_per_iteration(self) -> int:
         """Control steps that all environments take together for one decision each."""
-        return self.num_envs * (self.action_hold or 1)
+        return self.num_envs * self.num_held
+
+    @property
+    def num_updates(self) -> int:
+        """Gradient steps for each decision of all environments."""
+        return self.updates_per_iteration or max(1, round(self.steps_per_iteration / STEPS_PER_UPDATE))
 
     @property
     def learns_from_rollouts(self) -> bool:

@@ -18,6 +18,7 @@ import numpy as np
 
 from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.types import Array, Episodes, TimeStep, tree_where
+from hindrl_jax.config import TrainConfig
 
 FEWEST_DECISIONS = 60
 """Decisions that the median demonstration still takes when its actions are held for as long as can be."""
@@ -85,6 +86,13 @@ def longest_hold(lengths: np.ndarray) -> int:
       lengths: of the demonstrations, in control steps, any shape.
     """
     return max(1, int(np.median(lengths)) // FEWEST_DECISIONS)
+
+
+def with_action_hold(config: TrainConfig, demonstrations: Episodes) -> TrainConfig:
+    """The config with its `action_hold` chosen, if it is None: `longest_hold` of all demonstrations, whose lengths are control steps."""
+    if config.action_hold is not None:
+        return config
+    return dataclasses.replace(config, action_hold=longest_hold(np.asarray(demonstrations.lengths)))
 
 
 def hold_demonstrations(demonstrations: Episodes, num_held: int) -> Episodes:

@@ -9,6 +9,7 @@ from hindrl_jax.base.types import Array
 from hindrl_jax.config import AgentConfig, TrainConfig
 
 _LEAST_EXTENT = 1e-6
+_LEAST_DEVIATION = 0.1  # of the root mean square
 
 
 class InputScale(struct.PyTreeNode, kw_only=True):
@@ -21,10 +22,10 @@ class InputScale(struct.PyTreeNode, kw_only=True):
 
 
 def input_scale(observations: Array, achieved_goals: Array, is_visited: Array, config: AgentConfig) -> InputScale:
-    """The scale of each dimension over demonstration states.
+    """The mean and the standard deviation of each dimension over demonstration states; raw inputs have 0 and 1.
 
-    Standardised inputs have their mean as centre and their standard deviation as scale; others have centre 0 and the root mean square. A dimension
-    without extent has scale 1.
+    A deviation below a tenth of the root mean square counts as that tenth: what hardly moved in the demonstrations may move elsewhere. A dimension
+    that is always 0 has scale 1.
 
     Args:
       observations, achieved_goals: (..., D) and (..., G).
@@ -35,13 +36,23 @@ def input_scale(observations: Array, achieved_goals: Array, is_visited: Array, c
     def moments(values: Array) -> tuple[Array, Array]:
         axes, visited = tuple(range(values.ndim - 1)), is_visited[..., None]
         count = jnp.sum(is_visited)
-        centre = jnp.zeros(values.shape[-1])
-        if config.input_encoding == "standardised":
-            centre = jnp.sum(jnp.where(visited, values, 0.0), axis=axes) / count
-        offset = values - centre.reshape((1,) * len(axes) + centre.shape)
-        mean_square = jnp.sum(jnp.where(visited, jnp.square(offset), 0.0), axis=axes) / count
-        return centre, jnp.where(mean_square > _LEAST_EXTENT**2, jnp.sqrt(mean_square), 1.0)
 
+        def mean(values: Array) -> Array:
+            return jnp.sum(jnp.where(visited, values, 0.0), axis=axes) / count
+
+        centre, size = mean(values), jnp.sqrt(mean(jnp.square(values)))
+        deviation = jnp.sqrt(mean(jnp.square(values - centre.reshape((1,) * len(axes) + centre.shape))))
+        scale = jnp.maximum(deviation, _LEAST_DEVIATION * size)
+        return centre, jnp.where(scale > _LEAST_EXTENT, scale, 1.0)
+
+    if config.input_encoding == "raw":
+        observation_dim, goal_dim = observations.shape[-1], achieved_goals.shape[-1]
+        return InputScale(
+            observation=jnp.ones(observation_dim),
+            goal=jnp.ones(goal_dim),
+            observation_centre=jnp.zeros(observation_dim),
+            goal_centre=jnp.zeros(goal_dim),
+        )
     observation_centre, observation = moments(observations)
     goal_centre, goal = moments(achieved_goals)
     return InputScale(observation=observation, goal=goal, observation_centre=observation_centre, goal_centre=goal_centre)
@@ -51,15 +62,18 @@ def _encode(values: Array, centre: Array, scale: Array, config: AgentConfig) -> 
     if config.input_encoding == "raw":
         return values
     leading = (1,) * (values.ndim - 1)
-    scaled = (values - centre.reshape(leading + centre.shape)) / scale.reshape(leading + scale.shape)
-    return jnp.concatenate([scaled, jnp.tanh(4.0 * scaled)], axis=-1) if config.input_encoding == "multiscale" else scaled
+    centre, scale = centre.reshape(leading + centre.shape), scale.reshape(leading + scale.shape)
+    standardised = (values - centre) / scale
+    if config.input_encoding == "standardised":
+        return standardised
+    return jnp.concatenate([standardised, jnp.tanh(4.0 * values / jnp.sqrt(jnp.square(scale) + jnp.square(centre)))], axis=-1)
 
 
 def network_inputs(observation: Array, achieved_goal: Array, desired_goal: Array, scale: InputScale, config: TrainConfig) -> Array:
     """Joins what the networks see, along the last axis: (..., D), (..., G), (..., G) -> (..., input_dim).
 
-    The multiscale encoding gives each dimension twice: once linear, for distances, once saturating, so that "exactly there" and "one
-    step off" are far apart. With inputs as they are, small networks blur the two.
+    The multiscale encoding gives each dimension twice: standardised, for where in the task it is; and saturating around 0 in units of its root mean
+    square, so that where a dimension is a distance, "exactly there" and "one step off" are far apart. Small networks blur the two else.
     """
     observation, achieved_goal, desired_goal = (
         _encode(observation, scale.observation_centre, scale.observation, config.agent),

@@ -51,7 +51,7 @@ class Sampler(NamedTuple):
     record: Callable[[Any, ReplayState, ReplayState], Any]
     """(what is kept, replay before a step of all environments, after it) -> what is kept."""
     draw: Callable[[Array, TrainState, Guidance], tuple[Transition, Any]]
-    """(key, state, guidance) -> `updates_per_iteration` batches, leaves (U, B, ...), and what `learned` needs to know of them."""
+    """(key, state, guidance) -> `num_updates` batches, leaves (U, B, ...), and what `learned` needs to know of them."""
     learned: Callable[[TrainState, Transition, Any], Any]
     """(state after the gradient steps, the batches, what was said of them) -> what is kept."""
 
@@ -60,7 +60,7 @@ def uniform_sampler(env: Environment, config: TrainConfig) -> Sampler:
     """Draws episodes uniformly, then one of their transitions, see `batch.sample_batch`."""
 
     def draw(key: Array, state: TrainState, guidance: Guidance) -> tuple[Transition, Any]:
-        keys = jax.random.split(key, config.updates_per_iteration)
+        keys = jax.random.split(key, config.num_updates)
         return jax.vmap(lambda key: sample_batch(key, state.replay, guidance, state.env_steps, env, config))(keys), ()
 
     return Sampler(init=lambda *_: (), record=lambda *_: (), draw=draw, learned=lambda *_: ())
@@ -247,7 +247,7 @@ def collect(
 def learn(
     state: TrainState, guidance: Guidance, *, env: Steppable, config: TrainConfig, num_iterations: int, sampler: Sampler | None = None
 ) -> tuple[TrainState, Metrics]:
-    """`num_iterations` times: one step of every environment, then `updates_per_iteration` gradient steps.
+    """`num_iterations` times: one step of every environment, then `num_updates` gradient steps.
 
     Returns:
       The new state, and metrics averaged over the gradient steps.

@@ -22,7 +22,7 @@ def save_curve(result: Result, path: Path) -> None:
                 band(axis, x, values, MEAN)
             mean_line(axis, x, values, colour=MEAN, label=_mean_label(result))
         _mark_events(axes[0], result)
-        lengths = np.asarray(result.guidance.demonstrations.lengths) * (result.config.action_hold or 1)
+        lengths = np.asarray(result.guidance.demonstrations.lengths) * result.config.num_held
         axes[1].axhline(lengths.mean(), color=DEMONSTRATION, linestyle="--", linewidth=1, label="demonstrations")
         axes[0].legend(loc="lower right", frameon=False)
         axes[1].set(ylim=(0, result.env.horizon * 1.05), ylabel="episode length, steps", xlabel=_x_label(result))

@@ -1,12 +1,21 @@
 """Configs by name: the four models of the thesis, under the project's own recipe, the thesis's settings, or the original code's.
 
-    default    the project's own recipe, for a laptop CPU
+    default    the project's own recipe: one for all tasks
     thesis     the hyperparameters of the thesis's appendix, on plain correct code
     original   the same, with the quirks of the original implementation that explain its published figures
 
-Each has settings for the grid worlds and others for the reach tasks, as the thesis's appendix does. Beside them the default has a recipe for HinDRL
-in tasks whose observations hindsight relabels (`environments.RelabelsObservations`), such as ParameterizedReach. Environments of Gymnasium have the
-default only.
+The default is `TrainConfig()`, whatever the task is called. What differs between tasks follows from what they are and from the demonstrations:
+
+    action_hold            from the median length of the demonstrations (`core.holding.longest_hold`)
+    updates_per_iteration  one gradient step for every 4 environment steps
+    input scales, epsilon  from the demonstrations (`core.inputs.input_scale`, thesis eq. 4.7); epsilon is the environment's own tolerance where it
+                           tells one
+    behavioural goals      those that episodes come with; else the task's one goal where hindsight relabels observations; else the ends of
+                           demonstrations (thesis algorithm 5)
+    target entropy         from the number of action dimensions
+    random steps           one horizon in each environment
+
+The thesis has settings for the grid worlds and others for the reach tasks.
 """
 
 from __future__ import annotations
@@ -14,16 +23,15 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, Literal, get_args
 
-from hindrl_jax.base.environments import Environment
+from hindrl_jax.base.environments import Environment, RelabelsObservations
 from hindrl_jax.base.errors import UserError
+from hindrl_jax.base.steppers import can_step_on_host
 from hindrl_jax.config import AgentConfig, Algorithm, BatchConfig, GoalConfig, QuirksConfig, TrainConfig
-from hindrl_jax.tasks.registry import Family, did_you_mean, make, task
+from hindrl_jax.envs.reach import ReachTask
+from hindrl_jax.tasks.from_gymnasium import GymnasiumEnv
+from hindrl_jax.tasks.registry import did_you_mean, make
 
 Preset = Literal["default", "thesis", "original"]
-
-ORIGINAL_RULES: dict[str, dict[str, Any]] = {"grid": {"strict_order": False}, "reach": {"orientation": "axis_angle", "rotation_test": "axis_angle"}}
-"""Per family of environments, the arguments under which the original code ran: the last object wins alone, and orientations are axis-angles,
-which jump where the hand points down."""
 
 
 def preset(algo: Algorithm = "hindrl", name: Preset = "default", *, env: str | Environment = "FixedGridPickAndPlace") -> TrainConfig:
@@ -40,15 +48,19 @@ def preset(algo: Algorithm = "hindrl", name: Preset = "default", *, env: str | E
     for value, kind, known in ((algo, "algorithm", get_args(Algorithm)), (name, "preset", get_args(Preset))):
         if value not in known:
             raise UserError(f"unknown {kind} {value!r}{did_you_mean(value, known)}; choose one of {', '.join(known)}")
-    known_task = task(env if isinstance(env, str) else env.name)
-    family = known_task.family
-    if family == "gymnasium":
-        if name != "default":
-            raise UserError(f"the preset {name} is for the thesis's tasks: choose default for environments of Gymnasium")
-        return _as_algorithm(_gymnasium(algo, make(env) if isinstance(env, str) else env), algo)
-    if name == "default" and algo in ("hindrl", "smooth-hindrl") and hasattr(known_task.environment, "relabel_observations"):
-        return _as_algorithm(_observation_relabelling(), algo)
-    return _as_algorithm({"default": _default, "thesis": _thesis, "original": _original}[name](algo, family), algo)
+    env = make(env) if isinstance(env, str) else env
+    if name == "default":
+        return _as_algorithm(_default(algo, env), algo)
+    if isinstance(env, GymnasiumEnv):
+        raise UserError(f"the preset {name} is for the thesis's tasks: choose default for environments of Gymnasium")
+    return _as_algorithm({"thesis": _thesis, "original": _original}[name](algo, reach=isinstance(env, ReachTask)), algo)
+
+
+def original_rules(env: type[Any]) -> dict[str, Any]:
+    """The arguments under which the original code ran, of those that a class of environments has: the last object wins alone, and orientations are
+    axis-angles, which jump where the hand points down."""
+    rules: dict[str, Any] = {"strict_order": False, "orientation": "axis_angle", "rotation_test": "axis_angle"}
+    return {name: value for name, value in rules.items() if name in {field.name for field in dataclasses.fields(env)}}
 
 
 def _as_algorithm(config: TrainConfig, algo: Algorithm) -> TrainConfig:
@@ -61,98 +73,29 @@ def _as_algorithm(config: TrainConfig, algo: Algorithm) -> TrainConfig:
     return dataclasses.replace(config, algo=algo, batch=batch, goal=goal)
 
 
-_ARM_AGENT = AgentConfig(
-    layer_norm=True,
-    final_learning_rate=1e-5,
-    clip_targets=True,
-    actor_average_rate=1.0,
-    actor_average_span=0.5,
-    relative_value=True,
-    bc_weight=0.03,
-    final_bc_weight=0.0,
-)
-"""What both recipes for the arm have in common: clipped targets, cloning and a learning rate that fall, a long average of the actor, and an actor
-that climbs the value relative to its size. Each says for itself how far its target entropy falls."""
-
-
-def _default(algo: Algorithm, family: Family) -> TrainConfig:
-    """The project's own recipe. For the grid it is `TrainConfig()`, run for longer and with a reset of the agent."""
-    encoding: Literal["standardised", "multiscale"] = "standardised" if family == "reach" else "multiscale"
+def _default(algo: Algorithm, env: Environment) -> TrainConfig:
+    """The project's own recipe."""
+    goal = _goals(env)
     if algo == "bc":
-        return TrainConfig(
-            algo="bc",
-            steps=4_000,
-            eval_every=1_000,
-            batch=BatchConfig(n_step=1),
-            agent=AgentConfig(net_arch=(64, 64), actor_average_span=0.0, input_encoding=encoding),
-        )
-    if family == "grid":
-        return TrainConfig(steps=240_000, agent_resets=(1 / 3,))
-    return TrainConfig(
-        steps=44_000,
-        num_envs=8,
-        updates_per_iteration=8,
-        learning_starts=2_400,
-        demo_reset_ratio=0.75,
-        random_truncation=0.01,
-        eval_every=4_000,
-        eval_episodes=20,
-        batch=BatchConfig(n_step=10, gamma=0.99, bound_by_obtained_return=True),
-        goal=GoalConfig(epsilon_steps=5),
-        # -4, not -8: with less noise the mean action comes to rest at the edge of a waypoint (docs/recipe.md)
-        agent=dataclasses.replace(_ARM_AGENT, target_update_rate=0.01, final_target_entropy=-4.0, input_encoding=encoding),
-    )
+        agent = AgentConfig(net_arch=(64, 64), actor_average_span=0.0)
+        return TrainConfig(algo="bc", steps=4_000, eval_every=1_000, batch=BatchConfig(n_step=1), goal=goal, agent=agent)
+    return TrainConfig(goal=goal)
 
 
-def _observation_relabelling() -> TrainConfig:
-    """The recipe for `environments.RelabelsObservations`: four relabelled rows for each original one, and few demonstration rows."""
-    return TrainConfig(
-        steps=100_000,
-        num_envs=16,
-        updates_per_iteration=16,
-        learning_starts=4_800,
-        demo_reset_ratio=0.5,
-        eval_every=10_000,
-        batch=BatchConfig(n_step=3, max_demo_ratio=0.125, relabelled_per_original=4.0, hindrl_sampling_strategy="joint_union"),
-        goal=GoalConfig(epsilon_steps=5, behavioural_goals="task"),
-        agent=dataclasses.replace(_ARM_AGENT, final_target_entropy=-8.0),
-    )
-
-
-def _gymnasium(algo: Algorithm, env: Any) -> TrainConfig:
-    """The recipe for environments of Gymnasium: rollouts aim at the goal that an episode comes with, as the demonstrations did."""
-    tolerance = env.goal_tolerance
-    epsilon: dict[str, Any] = dict(epsilon_steps=5) if tolerance is None else dict(epsilon=round(float(tolerance.min()), 4))
-    goal = GoalConfig(behavioural_goals="environment", **epsilon)
-    if algo == "bc":
-        config = _default("bc", "reach")
-        return dataclasses.replace(config, goal=goal, eval_episodes=50)
-    return TrainConfig(
-        steps=50_000,
-        num_envs=8,
-        updates_per_iteration=8,
-        learning_starts=1_000,
-        eval_every=2_500,
-        eval_episodes=50,
-        goal=goal,
-        batch=BatchConfig(n_step=1, relabelled_per_original=1.0, hindrl_sampling_strategy="joint_union"),
-        agent=AgentConfig(
-            net_arch=(256, 256),
-            layer_norm=True,
-            learning_rate=1e-3,
-            clip_targets=True,
-            bc_weight=0.1,
-            initial_alpha=0.01,
-            input_encoding="standardised",
-        ),
-    )
+def _goals(env: Environment) -> GoalConfig:
+    """Goals and epsilon, by what the environment is."""
+    tolerance = getattr(env, "goal_tolerance", None)
+    epsilon: dict[str, Any] = {} if tolerance is None else dict(epsilon_steps=0, epsilon=round(float(tolerance.min()), 4))
+    if can_step_on_host(env) and env.gives_goals:
+        return GoalConfig(behavioural_goals="environment", **epsilon)
+    return GoalConfig(behavioural_goals="task" if isinstance(env, RelabelsObservations) else "final_demonstration_states", **epsilon)
 
 
 _FRAMEWORK: dict[str, Any] = dict(input_encoding="raw", actor_average_rate=1.0, actor_average_span=0.0)
 """How the networks of the thesis's framework are fed and evaluated."""
 
 
-def _thesis(algo: Algorithm, family: Family) -> TrainConfig:
+def _thesis(algo: Algorithm, *, reach: bool) -> TrainConfig:
     """Appendices A.1.1 and A.1.2, with what the text leaves to its framework: gamma 0.99, target rate 0.005, one environment, one update per step."""
     if algo == "bc":
         return TrainConfig(
@@ -163,7 +106,6 @@ def _thesis(algo: Algorithm, family: Family) -> TrainConfig:
             agent=AgentConfig(net_arch=(32, 32), learning_rate=1e-3, **_FRAMEWORK),
             quirks=QuirksConfig(achieved_goal_input=True),
         )
-    reach = family == "reach"
     return TrainConfig(
         steps=300_000,
         num_envs=1,
@@ -198,15 +140,15 @@ def _thesis(algo: Algorithm, family: Family) -> TrainConfig:
     )
 
 
-def _original(algo: Algorithm, family: Family) -> TrainConfig:
-    config = _thesis(algo, family)
+def _original(algo: Algorithm, *, reach: bool) -> TrainConfig:
+    config = _thesis(algo, reach=reach)
     quirks = dataclasses.replace(
         config.quirks,
         strict_goal_test=True,
         timeouts_are_terminal=True,
         exclude_last_goal=True,
         unscaled_demo_actions=True,
-        misaligned_demo_actions=family == "reach",
+        misaligned_demo_actions=reach,
     )
     if algo != "bc":  # the code's own baseline compares the mean action, squared
         quirks = dataclasses.replace(quirks, bc_loss="norm", bc_action="sample")

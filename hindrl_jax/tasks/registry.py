@@ -12,7 +12,7 @@ import inspect
 import os
 import sys
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.errors import UserError
@@ -25,7 +25,6 @@ from hindrl_jax.experts.reach import ReachExpert
 from hindrl_jax.experts.robosuite_arm import play_in_robosuite
 from hindrl_jax.tasks import from_gymnasium
 
-Family = Literal["grid", "reach", "gymnasium"]
 Act = Callable[[Array, Any, Array], Array]
 """(key, state, observation (D,)) -> action (A,) in the environment's own units."""
 Player = Callable[[Array, Any, Act, int, int], Episodes]
@@ -43,8 +42,6 @@ class Task:
     viewer: Any
     """What has save_png(env, state, path) and animation(env, states, captions=None) -> (pictures (H, W, 3), seconds that each is shown): an object,
     or the name of a module, which is imported only to draw. None where nothing does, or the environment draws itself."""
-    family: Family
-    """Which of the presets' recipes is for it."""
     summary: str
     """One line for the table of `hindrl envs`."""
     player: Player | None = None
@@ -56,12 +53,10 @@ _GRID_VIEWER, _REACH_VIEWER = "hindrl_jax.envs.grid.viewer", "hindrl_jax.envs.re
 TASKS: dict[str, Task] = {
     task.environment.name: task
     for task in (
-        Task(GridPickAndPlace, GridExpert, _GRID_VIEWER, "grid", "objects, agent and goal anywhere on the grid (thesis 3.1.1)"),
-        Task(FixedGridPickAndPlace, GridExpert, _GRID_VIEWER, "grid", "each of them within a small box of its own (thesis 3.1.2)"),
-        Task(ParameterizedReach, ReachExpert, _REACH_VIEWER, "reach", "a Panda arm reaches random poses in order (thesis 3.2.1)", play_in_robosuite),
-        Task(
-            FixedParameterizedReach, ReachExpert, _REACH_VIEWER, "reach", "the same, with poses that never change (thesis 3.2.2)", play_in_robosuite
-        ),
+        Task(GridPickAndPlace, GridExpert, _GRID_VIEWER, "objects, agent and goal anywhere on the grid (thesis 3.1.1)"),
+        Task(FixedGridPickAndPlace, GridExpert, _GRID_VIEWER, "each of them within a small box of its own (thesis 3.1.2)"),
+        Task(ParameterizedReach, ReachExpert, _REACH_VIEWER, "a Panda arm reaches random poses in order (thesis 3.2.1)", play_in_robosuite),
+        Task(FixedParameterizedReach, ReachExpert, _REACH_VIEWER, "the same, with poses that never change (thesis 3.2.2)", play_in_robosuite),
     )
 }
 
@@ -69,7 +64,7 @@ TASKS: dict[str, Task] = {
 _BUILT_IN = frozenset(TASKS)
 
 
-def register(environment: type[Any], *, expert: type[Any] | None = None, viewer: Any = None, family: Family = "grid", summary: str = "") -> None:
+def register(environment: type[Any], *, expert: type[Any] | None = None, viewer: Any = None, summary: str = "") -> None:
     """Adds a task of your own, which `make`, `preset`, `load_run` and the commands then know by name. A second call replaces the task.
 
     The commands take the name of the module, too, `hindrl train --env my_tasks:Maze`, import it from PYTHONPATH or the working directory, and it
@@ -82,8 +77,6 @@ def register(environment: type[Any], *, expert: type[Any] | None = None, viewer:
         elsewhere. Its fields become options of `hindrl demos record`.
       viewer: an object or module, or the name of a module, with save_png(env, state, path) and animation(env, states, captions=None), which returns
         pictures (H, W, 3) uint8 and the seconds that each is shown; None for no films.
-      family: which of the presets' recipes to begin with: "grid" for tasks of tens of steps, "reach" for hundreds of small ones. HinDRL in an
-        environment with `relabel_observations` begins with the recipe of ParameterizedReach.
       summary: one line for `hindrl envs`.
 
     Raises:
@@ -113,7 +106,7 @@ def register(environment: type[Any], *, expert: type[Any] | None = None, viewer:
         )
     if expert is not None and not hasattr(expert, "act"):
         raise UserError(f"{expert.__name__} lacks act(key, env, state), the action that the expert takes")
-    TASKS[name] = Task(environment, expert, viewer, family, summary)
+    TASKS[name] = Task(environment, expert, viewer, summary)
 
 
 def task(name: str) -> Task:
@@ -125,7 +118,7 @@ def task(name: str) -> Task:
     if name.startswith(from_gymnasium.PREFIX):
         environment = from_gymnasium.environment_class(name)
         expert = next((expert for expert in fetch.EXPERTS if environment.id.rpartition(":")[2].startswith(f"{expert.tasks}-")), None)
-        return Task(environment, expert, None, "gymnasium", "an environment of Gymnasium")
+        return Task(environment, expert, None, "an environment of Gymnasium")
     module, _, name = name.rpartition(":")
     if module:
         _import_from_here(module)

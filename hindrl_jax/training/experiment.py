@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -11,12 +10,13 @@ from typing import Any
 import jax
 import numpy as np
 
+from hindrl_jax.base.compilation import keep_compiled_programs
 from hindrl_jax.base.environments import Environment, can_step
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Episodes
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.core.agent import Policy, policy
-from hindrl_jax.core.holding import hold, hold_demonstrations, longest_hold
+from hindrl_jax.core.holding import hold, hold_demonstrations, with_action_hold
 from hindrl_jax.core.rollout import Evaluation
 from hindrl_jax.training.checks import check_config, check_seeds, check_trainable, configs_per_seed, demonstrations_per_seed
 from hindrl_jax.training.devices import gather, spread
@@ -46,6 +46,8 @@ def fit(
     With several devices the seeds are spread over as many as divide their number; with several hosts (after `jax.distributed.initialize`, the
     same call on each) they are shared evenly between the hosts first.
 
+    Compiled programs are kept on disk, see `hindrl_jax.base.compilation`.
+
     Args:
       env: the task.
       demonstrations: one table for all seeds, or one table per seed (with equal numbers of demonstrations).
@@ -67,6 +69,7 @@ def fit(
         memory.
       Diverged: if a loss or a value is not a finite number.
     """
+    keep_compiled_programs()
     check_trainable(env)
     check_seeds(seeds)
     tables = demonstrations_per_seed(demonstrations, seeds, env)
@@ -78,7 +81,7 @@ def fit(
     if config.demo_reset_ratio == 0.0:
         tables = tables.replace(states=None)  # nobody needs them on the devices
 
-    num_held = int(config.action_hold or 1)
+    num_held = config.num_held
     tables = hold_demonstrations(tables, num_held)
     started = time.perf_counter()
     with contextlib.closing(programs_of(hold(env, num_held), configs, tables)) as programs:
@@ -95,13 +98,6 @@ def fit(
         _train(result, programs, report)
     report(result)
     return result
-
-
-def with_action_hold(config: TrainConfig, demonstrations: Episodes) -> TrainConfig:
-    """The config with its `action_hold` chosen, if it is None: one for all seeds, from the median over all their demonstrations."""
-    if config.action_hold is not None:
-        return config
-    return dataclasses.replace(config, action_hold=longest_hold(np.asarray(demonstrations.lengths)))
 
 
 def programs_of(env: Environment, configs: Sequence[TrainConfig], demonstrations: Episodes) -> Programs:
@@ -135,7 +131,7 @@ def _train(result: Result, programs: Programs, report: Report) -> None:
         result.chunks.append(gather(metrics))
         if config.learns_from_rollouts:
             result.env_steps += programs.chunk * config.steps_per_iteration
-            result.updates += programs.chunk * config.updates_per_iteration
+            result.updates += programs.chunk * config.num_updates
         else:
             result.updates += programs.chunk
         _check_finite(result)
@@ -185,7 +181,7 @@ def _played(result: Result, programs: Programs, policies: Policy, num_episodes: 
     """What became of fresh episodes, numpy leaves (S, num_episodes), lengths in environment steps; they are counted."""
     result.key, evaluation = programs.evaluate(result.key, policies, result.guidance, num_episodes)
     evaluation = gather(evaluation)
-    evaluation = evaluation.replace(length=evaluation.length * (result.config.action_hold or 1))
+    evaluation = evaluation.replace(length=evaluation.length * result.config.num_held)
     before = 0 if result.evaluation_steps is None else result.evaluation_steps
     result.evaluation_steps = before + np.asarray(evaluation.length).sum(axis=1, dtype=np.int64)
     return evaluation

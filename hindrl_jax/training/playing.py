@@ -111,7 +111,7 @@ class TrainedPolicies:
     @property
     def num_held(self) -> int:
         """Steps for which each action is held."""
-        return self.config.action_hold or 1
+        return self.config.num_held
 
     def evaluate(self, keys: Array, num_episodes: int, report: Callable[[int], None] = lambda played: None) -> Evaluation:
         """Plays fresh episodes with each policy; leaves (S, num_episodes).

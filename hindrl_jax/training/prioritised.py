@@ -173,7 +173,7 @@ def prioritised_sampler(env: Environment, config: TrainConfig) -> Sampler:
 
     def draw_batches(key: Array, state: TrainState, guidance: Guidance) -> tuple[Transition, tuple[Drawn, Array]]:
         key_batch, key_errors = jax.random.split(key)
-        keys = jax.random.split(key_batch, config.updates_per_iteration)
+        keys = jax.random.split(key_batch, config.num_updates)
         batches, drawn = jax.vmap(lambda key: sample_batch(key, state, guidance, env, config))(keys)
         return batches, (drawn, key_errors)
 
