@@ -18,7 +18,7 @@ class AgentConfig:
     ddpg need a preactivation_weight."""
     net_arch: tuple[int, ...] = (64, 64, 64, 64)
     """Widths of the hidden layers, the same for actor and critics."""
-    layer_norm: bool = False
+    layer_norm: bool = True
     """Layer normalisation before each activation of the critics."""
     network_precision: Literal["float32", "bfloat16"] = "float32"
     """Operands of the networks' products: float32 (on NVIDIA GPUs TF32, as JAX has it), or bfloat16 summed in float32: faster, less steady."""
@@ -26,7 +26,7 @@ class AgentConfig:
     """Adam's step size, for actor, critics and entropy coefficient."""
     final_learning_rate: float | None = None
     """Where the step size has moved, linearly, by the end of the run; None keeps it constant."""
-    clip_targets: bool = False
+    clip_targets: bool = True
     """Clip the critics' targets to [0, 1], which holds every return where the one reward of an episode is 1 and ends it (Andrychowicz et al.,
     hindsight experience replay, 2017)."""
     num_critics: int = 2
@@ -45,9 +45,9 @@ class AgentConfig:
     """Share of the gradient steps so far that the average spans at least: it moves by at most 1 / (1 + span * steps), less and less."""
     initial_alpha: float = 0.002
     """Entropy coefficient at the start; it is tuned automatically from there."""
-    target_entropy: float | None = -1.0
+    target_entropy: float | None = None
     """Entropy that the automatic tuning aims at, in nats; None means minus the number of action dimensions."""
-    final_target_entropy: float | None = -10.0
+    final_target_entropy: float | None = None
     """Where the target entropy has moved, linearly, by the end of the run; None keeps it constant."""
     exploration_noise: float = 0.1
     """For td3 and ddpg: standard deviation of the noise on the actions of rollouts, which lie in [-1, 1]."""
@@ -62,7 +62,7 @@ class AgentConfig:
     preactivation_weight: float = 0.0
     """Weight, in the actor's loss, of the squared length of the mode before tanh (HER, appendix A). Without entropy nothing else keeps td3 and ddpg
     away from saturated actions, which have no gradient."""
-    bc_weight: float = 0.01
+    bc_weight: float = 0.05
     """Weight of the behaviour cloning loss on demonstration rows (lambda_BC of the thesis)."""
     final_bc_weight: float | None = None
     """Where that weight has moved, linearly, by the end of the run; None keeps it constant."""

@@ -19,7 +19,7 @@ class BatchConfig:
 
     batch_size: int = 256
     """Rows of the batch of a gradient step, demonstrations included."""
-    max_demo_ratio: float = 0.25
+    max_demo_ratio: float = 0.5
     """Share of demonstration rows in the batch at the start of training (MAX_d of thesis eq. 4.9, as a ratio)."""
     reach_zero: int | None = None
     """Environment step at which the demonstration share has fallen linearly to zero (thesis eq. 4.9); None keeps it constant."""

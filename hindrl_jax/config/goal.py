@@ -12,7 +12,7 @@ from hindrl_jax.base.checks import check, check_types
 class GoalConfig:
     """Epsilon, the goals taken from demonstrations, and the behavioural goals."""
 
-    epsilon_steps: int = 0
+    epsilon_steps: int = 1
     """Distance in steps between the demonstration states whose mean distance gives epsilon (m of thesis eq. 4.7); 0 gives epsilon 0."""
     epsilon_deviations: float = 0.0
     """Weight of the standard deviation of these distances in epsilon (k of thesis eq. 4.7)."""
@@ -42,9 +42,9 @@ class GoalConfig:
                 "between 0 and 1, or None",
             ),
         )
-        if self.epsilon is not None and self.epsilon_steps > 0:
+        if self.epsilon is not None and self.epsilon_steps > 1:
             raise ValueError(
-                f"epsilon_steps = {self.epsilon_steps} is of no use while epsilon = {self.epsilon} is given: set the one to 0, or the other to None"
+                f"epsilon_steps = {self.epsilon_steps} is of no use while epsilon = {self.epsilon} is given: leave the one at 1, or set the other to None"
             )
 
     @property

@@ -25,8 +25,9 @@ class QuirksConfig:
     """Leave demonstrated actions in the environment's own range, as the original code does, in place of the policy's [-1, 1]."""
     misaligned_demo_actions: bool = False
     """Pair each demonstrated action with the observation after it, as the original code does for robot demonstrations."""
-    bc_loss: Literal["squared", "norm"] = "squared"
-    """Squared distance to the demonstrated action (thesis), or its square root per row (original code)."""
+    bc_loss: Literal["relative", "squared", "norm"] = "relative"
+    """Squared distance to the demonstrated action, relative to the mean squared length of demonstrated actions, so that one weight serves tasks with
+    large and with small actions; or as it is (thesis); or its square root per row (original code)."""
     bc_action: Literal["mean", "sample"] = "mean"
     """Compare the policy's mean action (thesis) or a sampled one (original code) with the demonstrated action."""
     achieved_goal_input: bool = False

@@ -23,16 +23,16 @@ class TrainConfig:
 
     algo: Algorithm = "hindrl"
     """Which of the four models: bc, tqcfd (no relabelling), hindrl, smooth-hindrl."""
-    steps: int = 160_000
+    steps: int = 100_000
     """Environment steps of the run per seed, rounded up to a tenth of eval_every; for bc, which takes none, gradient steps."""
-    num_envs: int = 16
+    num_envs: int = 8
     """Environments stepped side by side."""
     action_hold: int | None = None
     """Control steps for which each action is held: one decision of the policy. Steps, horizon and episode lengths count control steps; epsilon_steps,
     n_step and gamma count decisions. None lets `fit` choose: as many as leave the median demonstration at least 60 decisions."""
     updates_per_iteration: int | None = None
     """Gradient steps after each decision of all environments; None takes one for every 4 control steps."""
-    learning_starts: int = 1_600
+    learning_starts: int = 0
     """Environment steps with uniformly random actions before the first gradient step; at least one horizon in each environment is taken."""
     demo_reset_ratio: float = 0.0
     """Share of training episodes that begin in a demonstrated state, drawn uniformly, with the steps that it had left (Nair et al., overcoming

@@ -1,4 +1,4 @@
-"""Ablation: the grid tasks' default recipe until its agent is reset, with one change at a time, on several tasks, with the same seeds for all.
+"""Ablation: a recipe for the grid tasks, `options.RECIPE`, with one change at a time, on several tasks, with the same seeds for all.
 
     OUT/TASK/OPTION/   an ordinary run's directory for each cell; OUT/TASK/default/ has no change, the baseline
     ablation.csv       a row for each cell
@@ -17,14 +17,12 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from hindrl_jax.base.files import disk_trouble
-from hindrl_jax.config import TrainConfig
 from hindrl_jax.reproduction.cells import Cell, Task
-from hindrl_jax.reproduction.options import BASELINE, OPTIONS, Option, apply
+from hindrl_jax.reproduction.options import BASELINE, OPTIONS, RECIPE, Option, apply
 from hindrl_jax.reproduction.outcomes import Outcome
 from hindrl_jax.reproduction.picture import save_differences
 from hindrl_jax.reproduction.tables import EXPLANATION, markdown, write_csv
 from hindrl_jax.runs.spec import RunSpec
-from hindrl_jax.tasks.presets import preset
 from hindrl_jax.tasks.registry import checked, make
 
 TABLE, TEXT, PICTURE = "ablation.csv", "ablation.md", "ablation.png"
@@ -44,7 +42,7 @@ def cells_of(out: Path, *, tasks: Iterable[str], options: Iterable[Option], seed
       tasks: keys of `TASKS`.
       options: which of `OPTIONS`.
       seeds: the same for all cells.
-      steps: environment steps of each run; None takes those of the recipe until its agent is reset.
+      steps: environment steps of each run; None takes those of the recipe.
 
     Raises:
       UserError: if a config is refused.
@@ -52,19 +50,12 @@ def cells_of(out: Path, *, tasks: Iterable[str], options: Iterable[Option], seed
     cells = []
     for name, option in itertools.product(tasks, (BASELINE, *options)):
         task = TASKS[name]
-        config = _until_reset(preset("hindrl", env=task.env))
+        config = RECIPE
         if steps is not None:
             config = checked(functools.partial(dataclasses.replace, config, steps=steps))
         spec = RunSpec(env=make(task.env, **dict(task.env_args)), config=apply(config, option), demos=str(task.num_demos), seeds=seeds)
         cells.append(Cell(task=name, group=option.group, name=option.name, path=out / name / option.name, spec=spec))
     return cells
-
-
-def _until_reset(config: TrainConfig) -> TrainConfig:
-    """The recipe until its agent is reset: what a change does shows there, and what is learnt after the reset would hide it."""
-    if not config.agent_resets:
-        return config
-    return dataclasses.replace(config, steps=round(config.steps * config.agent_resets[0]), agent_resets=())
 
 
 def write_tables(out: Path, outcomes: Sequence[Outcome]) -> None:
@@ -76,12 +67,12 @@ def write_tables(out: Path, outcomes: Sequence[Outcome]) -> None:
     with disk_trouble(out):
         write_csv(out / TABLE, outcomes, row_name="option")
         (out / TEXT).write_text(_as_text(outcomes))
-        save_differences(outcomes, out / PICTURE, title="One change to the default recipe")
+        save_differences(outcomes, out / PICTURE, title="One change to the recipe")
 
 
 _EXPLANATION = """# Ablation
 
-The default recipe until its agent is reset, with one change at a time, {seeds} seeds from {first}, {steps:,} environment steps each. Every
+A recipe for the grid tasks, with one change at a time, {seeds} seeds from {first}, {steps:,} environment steps each. Every
 change is trained with the same seeds, which have the same demonstrations. In brackets: 95% bootstrap intervals over the seeds, somewhat too narrow
 with 16 seeds and much too narrow with fewer than 8 or so. They describe single comparisons: of changes without any effect, one in twenty or more
 shows a difference by chance.

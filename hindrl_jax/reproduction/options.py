@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, Literal
 
-from hindrl_jax.config import TrainConfig
+from hindrl_jax.config import AgentConfig, BatchConfig, GoalConfig, QuirksConfig, TrainConfig
 from hindrl_jax.tasks.registry import checked
 
 Group = Literal["baseline", "algorithm", "hindsight", "goals", "targets", "demonstrations", "critic", "actor", "inputs", "replay", "rollout"]
@@ -13,7 +13,7 @@ Group = Literal["baseline", "algorithm", "hindsight", "goals", "targets", "demon
 
 @dataclasses.dataclass(frozen=True)
 class Option:
-    """One change to the default recipe."""
+    """One change to the recipe."""
 
     name: str
     """In kebab case; the name of its directory."""
@@ -30,7 +30,20 @@ def half_of_the_run(config: TrainConfig) -> int:
     return config.steps // 2
 
 
-BASELINE = Option("default", "baseline", "the default recipe until its agent is reset", ())
+RECIPE = TrainConfig(
+    steps=80_000,
+    num_envs=16,
+    action_hold=1,
+    updates_per_iteration=2,
+    learning_starts=1_600,
+    batch=BatchConfig(max_demo_ratio=0.25),
+    goal=GoalConfig(epsilon_steps=0),
+    agent=AgentConfig(layer_norm=False, clip_targets=False, target_entropy=-1.0, final_target_entropy=-10.0, bc_weight=0.01),
+    quirks=QuirksConfig(bc_loss="squared"),
+)
+"""What is ablated: the recipe for the grid tasks that this project had when it was measured (docs/ablation.md). The default has moved on since."""
+
+BASELINE = Option("default", "baseline", "the recipe as it is", ())
 
 OPTIONS: tuple[Option, ...] = (
     Option("sac", "algorithm", "SAC in place of TQC", (("agent.base", "sac"),)),

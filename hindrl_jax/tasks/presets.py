@@ -78,7 +78,7 @@ def _default(algo: Algorithm, env: Environment) -> TrainConfig:
     goal = _goals(env)
     if algo == "bc":
         agent = AgentConfig(net_arch=(64, 64), actor_average_span=0.0)
-        return TrainConfig(algo="bc", steps=4_000, eval_every=1_000, batch=BatchConfig(n_step=1), goal=goal, agent=agent)
+        return TrainConfig(algo="bc", steps=4_000, action_hold=1, eval_every=1_000, batch=BatchConfig(n_step=1), goal=goal, agent=agent)
     return TrainConfig(goal=goal)
 
 
@@ -101,14 +101,16 @@ def _thesis(algo: Algorithm, *, reach: bool) -> TrainConfig:
         return TrainConfig(
             algo="bc",
             steps=20_000,
+            action_hold=1,
             eval_every=1_000,
             batch=BatchConfig(batch_size=2_048, n_step=1),
             agent=AgentConfig(net_arch=(32, 32), learning_rate=1e-3, **_FRAMEWORK),
-            quirks=QuirksConfig(achieved_goal_input=True),
+            quirks=QuirksConfig(achieved_goal_input=True, bc_loss="squared"),
         )
     return TrainConfig(
         steps=300_000,
         num_envs=1,
+        action_hold=1,
         updates_per_iteration=1,
         learning_starts=5_000 if reach else 10_000,
         buffer_size=1_000_000 if reach else 500_000,
@@ -126,6 +128,7 @@ def _thesis(algo: Algorithm, *, reach: bool) -> TrainConfig:
         agent=AgentConfig(
             net_arch=8 * (32,) if reach else 4 * (64,),  # for reach the appendix prints seven layers, the code has eight
             layer_norm=False,
+            clip_targets=False,
             learning_rate=1e-3,
             final_learning_rate=None,
             top_quantiles_to_drop_per_net=8 if reach else 2,
@@ -136,7 +139,7 @@ def _thesis(algo: Algorithm, *, reach: bool) -> TrainConfig:
             bc_weight=0.0 if reach else 1.0,
             **_FRAMEWORK,
         ),
-        quirks=QuirksConfig(achieved_goal_input=True, bootstrap_past_relabelled_goals=True),
+        quirks=QuirksConfig(achieved_goal_input=True, bootstrap_past_relabelled_goals=True, bc_loss="squared"),
     )
 
 
