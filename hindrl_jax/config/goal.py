@@ -44,7 +44,7 @@ class GoalConfig:
         )
         if self.epsilon is not None and self.epsilon_steps > 1:
             raise ValueError(
-                f"epsilon_steps = {self.epsilon_steps} is of no use while epsilon = {self.epsilon} is given: leave the one at 1, or set the other to None"
+                f"epsilon_steps = {self.epsilon_steps} is of no use while epsilon = {self.epsilon} is given: set one to 1 or the other to None"
             )
 
     @property

@@ -38,7 +38,9 @@ RECIPE = TrainConfig(
     learning_starts=1_600,
     batch=BatchConfig(max_demo_ratio=0.25),
     goal=GoalConfig(epsilon_steps=0),
-    agent=AgentConfig(layer_norm=False, clip_targets=False, target_entropy=-1.0, final_target_entropy=-10.0, bc_weight=0.01),
+    agent=AgentConfig(
+        net_arch=(64, 64, 64, 64), layer_norm=False, clip_targets=False, target_entropy=-1.0, final_target_entropy=-10.0, bc_weight=0.01
+    ),
     quirks=QuirksConfig(bc_loss="squared"),
 )
 """What is ablated: the recipe for the grid tasks that this project had when it was measured (docs/ablation.md). The default has moved on since."""

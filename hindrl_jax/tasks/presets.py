@@ -12,7 +12,10 @@ The default is `TrainConfig()`, whatever the task is called. What differs betwee
                            tells one
     behavioural goals      those that episodes come with; else the task's one goal where hindsight relabels observations; else the ends of
                            demonstrations (thesis algorithm 5)
-    target entropy         from the number of action dimensions
+    relabelling            where episodes have goals of their own, or parameters of the task in their observations, half of the replay rows, with
+                           goals of demonstrations and rollouts; where all aim at the same, a fifth, with goals of demonstrations: there, other
+                           goals are not what is to be learnt, and take room in the batch
+    target entropy         minus the number of action dimensions
     random steps           one horizon in each environment
 
 The thesis has settings for the grid worlds and others for the reach tasks.
@@ -79,14 +82,27 @@ def _default(algo: Algorithm, env: Environment) -> TrainConfig:
     if algo == "bc":
         agent = AgentConfig(net_arch=(64, 64), actor_average_span=0.0)
         return TrainConfig(algo="bc", steps=4_000, action_hold=1, eval_every=1_000, batch=BatchConfig(n_step=1), goal=goal, agent=agent)
-    return TrainConfig(goal=goal)
+    return TrainConfig(goal=goal, batch=_MANY_TASKS if _has_many_tasks(env) else BatchConfig())
+
+
+_MANY_TASKS = BatchConfig(relabelled_per_original=1.0, hindrl_sampling_strategy="joint_union")
+"""Relabelling where hindsight turns an episode into one of another task that is to be learnt, too."""
+
+
+def _gives_goals(env: Environment) -> bool:
+    return can_step_on_host(env) and env.gives_goals
+
+
+def _has_many_tasks(env: Environment) -> bool:
+    """Whether episodes have goals, or parameters in their observations, of their own; else all of them aim at what the demonstrations end in."""
+    return _gives_goals(env) or isinstance(env, RelabelsObservations)
 
 
 def _goals(env: Environment) -> GoalConfig:
     """Goals and epsilon, by what the environment is."""
     tolerance = getattr(env, "goal_tolerance", None)
-    epsilon: dict[str, Any] = {} if tolerance is None else dict(epsilon_steps=0, epsilon=round(float(tolerance.min()), 4))
-    if can_step_on_host(env) and env.gives_goals:
+    epsilon: dict[str, Any] = {} if tolerance is None else dict(epsilon=round(float(tolerance.min()), 4))
+    if _gives_goals(env):
         return GoalConfig(behavioural_goals="environment", **epsilon)
     return GoalConfig(behavioural_goals="task" if isinstance(env, RelabelsObservations) else "final_demonstration_states", **epsilon)
 
