@@ -104,8 +104,9 @@ def hold_demonstrations(demonstrations: Episodes, num_held: int) -> Episodes:
     lengths = jnp.asarray(demonstrations.lengths)
     steps = demonstrations.actions.shape[-2]
     horizon = -(-steps // num_held)
-    starts = jnp.minimum(jnp.arange(horizon + 1) * num_held, lengths[..., None])  # (..., N, decisions + 1), control steps
-    taken = jnp.arange(steps) < lengths[..., None]  # (..., N, T), past the end there is padding
+    leading = tuple(range(lengths.ndim))
+    starts = jnp.minimum(jnp.expand_dims(jnp.arange(horizon + 1) * num_held, leading), lengths[..., None])  # (..., N, decisions + 1), control steps
+    taken = jnp.expand_dims(jnp.arange(steps), leading) < lengths[..., None]  # (..., N, T), past the end there is padding
 
     def at_decisions(values: Array) -> Array:
         return jnp.take_along_axis(jnp.asarray(values), starts[..., None], axis=-2)

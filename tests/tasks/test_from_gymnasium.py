@@ -100,7 +100,7 @@ def test_held_actions_are_steps_with_the_same_action_up_to_the_goal(simulators, 
     observation, goal = held.begin(np.array([4, 5]))
     stepped.begin(np.array([4, 5]))
     wish = np.clip((goal - observation[:, 3:]) / SPEED / 3, -1, 1) * 2 * np.array([[1], [0]])
-    assert (np.linalg.norm(goal - observation[:, 3:], axis=1) > 0.3).all()
+    assert (np.linalg.norm(goal - observation[:, 3:], axis=1) > 3 * 0.2).all()
     steps = [stepped.step(wish, begin_anew=False) for _ in range(3)]
     outcome = held.step(wish)
     assert [bool(step.success[0]) for step in steps] == [False, False, True]
