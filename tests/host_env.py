@@ -12,10 +12,13 @@ from hindrl_jax.base.steppers import Outcome
 
 
 class CorridorStepper:
-    """N corridors side by side. The observation is (start, step, position), start being different in every episode."""
+    """N corridors side by side. The observation is (start, step, position), start being different in every episode.
 
-    def __init__(self, env, num_envs):
-        self.env, self.num_envs, self.closed = env, num_envs, False
+    Each action is held for `num_held` steps, or until the episode is over.
+    """
+
+    def __init__(self, env, num_envs, num_held=1):
+        self.env, self.num_envs, self.num_held, self.closed = env, num_envs, num_held, False
 
     def begin(self, seeds):
         self.randomness = [np.random.default_rng(seed) for seed in seeds]
@@ -24,10 +27,13 @@ class CorridorStepper:
         return self._observation(), None
 
     def step(self, actions):
-        self.position = self.position + np.clip(actions, self.env.action_low, self.env.action_high)[:, 0]
-        self.step_in_episode = self.step_in_episode + 1
-        solved = self.position > self.env.width
-        truncated = (self.step_in_episode >= self.env.horizon) & ~solved
+        going_on = np.ones(self.num_envs, bool)
+        for _ in range(self.num_held):
+            self.position = self.position + going_on * np.clip(actions, self.env.action_low, self.env.action_high)[:, 0]
+            self.step_in_episode = self.step_in_episode + going_on
+            solved = self.position > self.env.width
+            truncated = (self.step_in_episode >= self.env.horizon) & ~solved
+            going_on = ~(solved | truncated)
         next_observation = self._observation()
         for index in np.flatnonzero(solved | truncated):
             self.start[index], self.step_in_episode[index], self.position[index] = self.randomness[index].uniform(), 0, 0
@@ -71,5 +77,5 @@ class HostCorridor:
         return jnp.array([self.width])
 
     def stepper(self, num_envs, *, num_held=1):
-        self.made.append(CorridorStepper(self, num_envs))
+        self.made.append(CorridorStepper(self, num_envs, num_held))
         return self.made[-1]

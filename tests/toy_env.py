@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +25,8 @@ class CorridorState:
 class Corridor:
     """Walk right until the position exceeds `width`. The action is a velocity in [0, 2]; the observation is (start, step, position)."""
 
-    name: str = "Corridor"
+    name: ClassVar[str] = "Corridor"
+
     horizon: int = 5
     width: float = 3.0
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
 import sys
@@ -93,10 +94,16 @@ def run(spec: RunSpec, configs: Sequence[TrainConfig], writer: RunWriter | Sweep
         learning = False
 
         def begin(result: Result) -> None:
+            for of_setting, config in zip(writer.runs, result.configs[::num_seeds], strict=True):
+                of_setting.spec = dataclasses.replace(of_setting.spec, config=config)  # with what `fit` has chosen
             writer.start()
             if checkpoints is not None:
                 checkpoints.save_demonstrations(demonstrations)
             progress.say(f"compiled in {result.compile_seconds:.1f} s{_on_devices(result)}")
+            num_held = result.config.num_held
+            if num_held > 1:
+                steps = int(np.median([table.lengths for table in demonstrations]))
+                progress.say(f"each action is held for {num_held} steps, so a demonstration of {steps} steps takes {-(-steps // num_held)} decisions")
             for share in spec.config.agent_resets:
                 progress.say(f"the agent begins anew at step {share * spec.config.steps:,.0f}, so success will drop there and come back")
             if resumes:

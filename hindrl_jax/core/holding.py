@@ -14,7 +14,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.types import Array, Episodes, TimeStep, tree_where
@@ -48,7 +47,7 @@ def _held_class(kind: type[Any]) -> type[Any]:
     """`HeldActions` with all public attributes of a class of environments, so that abilities can be asked for as ever."""
     own = {"reset": _delegated("reset"), "step": _step, "stepper": _stepper}
     names = {name for name in (*dir(kind), *(field.name for field in dataclasses.fields(kind))) if not name.startswith("_")}
-    members = {name: own.get(name) or _delegated(name) for name in names if name not in ("horizon", "watched")}
+    members = {name: own.get(name) or _delegated(name) for name in names if name not in ("horizon", "watched", "env", "num_held")}
     return type("HeldActions", (HeldActions,), members)
 
 
@@ -79,20 +78,20 @@ def _stepper(held: HeldActions, num_envs: int) -> Any:
     return held.env.stepper(num_envs, num_held=held.num_held)
 
 
-def longest_hold(lengths: np.ndarray) -> int:
+def longest_hold(lengths: Array) -> int:
     """For how many control steps actions can be held: the most with which the median demonstration takes `FEWEST_DECISIONS`, at least 1.
 
     Args:
       lengths: of the demonstrations, in control steps, any shape.
     """
-    return max(1, int(np.median(lengths)) // FEWEST_DECISIONS)
+    return max(1, int(jnp.median(lengths)) // FEWEST_DECISIONS)
 
 
 def with_action_hold(config: TrainConfig, demonstrations: Episodes) -> TrainConfig:
     """The config with its `action_hold` chosen, if it is None: `longest_hold` of all demonstrations, whose lengths are control steps."""
     if config.action_hold is not None:
         return config
-    return dataclasses.replace(config, action_hold=longest_hold(np.asarray(demonstrations.lengths)))
+    return dataclasses.replace(config, action_hold=longest_hold(demonstrations.lengths))
 
 
 def hold_demonstrations(demonstrations: Episodes, num_held: int) -> Episodes:
@@ -110,23 +109,28 @@ def hold_demonstrations(demonstrations: Episodes, num_held: int) -> Episodes:
     """
     if num_held == 1:
         return demonstrations
-    lengths = np.asarray(demonstrations.lengths)
-    horizon = -(-demonstrations.actions.shape[-2] // num_held)
-    starts = np.minimum(np.arange(horizon + 1) * num_held, lengths[..., None])  # (..., N, decisions + 1), control steps
+    lengths = jnp.asarray(demonstrations.lengths)
+    steps = demonstrations.actions.shape[-2]
+    horizon = -(-steps // num_held)
+    leading = tuple(range(lengths.ndim))
+    starts = jnp.minimum(jnp.expand_dims(jnp.arange(horizon + 1) * num_held, leading), lengths[..., None])  # (..., N, decisions + 1), control steps
+    taken = jnp.expand_dims(jnp.arange(steps), leading) < lengths[..., None]  # (..., N, T), past the end there is padding
 
-    def at_decisions(values: Any) -> np.ndarray:
-        return np.take_along_axis(np.asarray(values), starts[..., None], axis=-2)
+    def at_decisions(values: Array) -> Array:
+        return jnp.take_along_axis(jnp.asarray(values), starts[..., None], axis=-2)
 
-    def sums(values: Any) -> np.ndarray:
+    def sums(values: Array) -> Array:
         """(..., N, T, X) -> (..., N, decisions, X), over the control steps of each decision."""
-        values = np.asarray(values)
-        so_far = np.concatenate([np.zeros_like(values[..., :1, :]), np.cumsum(values, axis=-2, dtype=np.float64)], axis=-2)
-        return np.diff(np.take_along_axis(so_far, starts[..., None], axis=-2), axis=-2).astype(np.float32)
+        values = jnp.where(taken[..., None], jnp.asarray(values), 0.0)
+        nothing = [(0, 0)] * (values.ndim - 2)
+        values = jnp.pad(values, [*nothing, (0, horizon * num_held - steps), (0, 0)])
+        return values.reshape(*values.shape[:-2], horizon, num_held, values.shape[-1]).sum(axis=-2)
 
-    return demonstrations.replace(
+    held = demonstrations.replace(
         observations=at_decisions(demonstrations.observations),
-        actions=sums(demonstrations.actions) / np.maximum(np.diff(starts, axis=-1), 1)[..., None],
-        rewards=sums(np.asarray(demonstrations.rewards)[..., None])[..., 0],
+        actions=sums(demonstrations.actions) / jnp.maximum(jnp.diff(starts, axis=-1), 1)[..., None],
+        rewards=sums(demonstrations.rewards[..., None])[..., 0],
         lengths=-(-lengths // num_held),
         states=None if demonstrations.states is None else at_decisions(demonstrations.states),
     )
+    return jax.device_get(held)

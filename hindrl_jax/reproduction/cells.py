@@ -61,7 +61,7 @@ def is_finished(cell: Cell) -> bool:
     Raises:
       UserError: if it holds a configuration that cannot be read.
     """
-    return all((cell.path / name).exists() for name in (CONFIG, SUMMARY)) and read_spec(cell.path) == cell.spec
+    return all((cell.path / name).exists() for name in (CONFIG, SUMMARY)) and _read_as_asked(cell) == cell.spec
 
 
 def check_can_train(cells: Iterable[Cell], *, overwrite: bool) -> None:
@@ -76,12 +76,18 @@ def check_can_train(cells: Iterable[Cell], *, overwrite: bool) -> None:
         if overwrite or not (cell.path / CONFIG).exists():
             RunWriter(cell.path, cell.spec, overwrite=overwrite)
             continue
-        there, asked = (flatten_dict(spec.to_json(), sep=".") for spec in (read_spec(cell.path), cell.spec))
+        there, asked = (flatten_dict(spec.to_json(), sep=".") for spec in (_read_as_asked(cell), cell.spec))
         different = [name for name in asked | there if name not in asked or name not in there or asked[name] != there[name]]
         if different:
             raise UserError(
                 f"{cell.path} holds a run of other options ({', '.join(different)}): choose another --out, or replace it with --overwrite"
             )
+
+
+def _read_as_asked(cell: Cell) -> RunSpec:
+    """What the directory's run was asked to do. What the cell leaves to `fit` to choose is left out."""
+    found = read_spec(cell.path)
+    return found if cell.spec.config.action_hold else dataclasses.replace(found, config=dataclasses.replace(found.config, action_hold=None))
 
 
 def train(cell: Cell, *, report: Callable[[Result], None] = lambda result: None) -> None:
@@ -96,6 +102,7 @@ def train(cell: Cell, *, report: Callable[[Result], None] = lambda result: None)
 
     def write_and_report(result: Result) -> None:
         if not writer.started:
+            writer.spec = dataclasses.replace(spec, config=result.config)  # with what `fit` has chosen
             writer.start()
         writer.report(result.rows)
         report(result)

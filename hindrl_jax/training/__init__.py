@@ -4,6 +4,7 @@ Environments are asked what they can do (`hindrl_jax.base`), never of what kind 
 
     experiment      fit: the loop between the programs, with evaluations
     result          what it leaves: Result, Row, SeedSummary
+    selection       the policies that are kept along a run, and which of them is returned
     checks          what is refused, in a line that names the ability that is missing
     programs        the compiled programs of an experiment; of environments that are stepped in JAX
     host            the same for environments that are stepped outside JAX

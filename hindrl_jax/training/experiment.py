@@ -52,8 +52,9 @@ def fit(
       env: the task.
       demonstrations: one table for all seeds, or one table per seed (with equal numbers of demonstrations).
       config: for example from `preset`; one for all seeds, or one per seed. They may differ in the fields of `config.SWEEPABLE`.
-      seeds: non-negative integers. A seed gives the same run whatever the others are, up to floating-point rounding.
-      report: called after compilation, several times between evaluations, after each evaluation, and at the end. Where it returns something true
+      seeds: non-negative integers. A seed gives the same run whatever the others are, up to floating-point rounding. But an `action_hold` of None is
+        chosen by the demonstrations of all of them, and with `stop_at` they all learn on until the last of them is done.
+      report: called after compilation, several times between evaluations, after each evaluation, and at the end. Where it returns True
         while the experiment learns, that ends: what was found so far is returned as ever.
       restore: called before anything is computed with a result whose guidance, state and key are `jax.ShapeDtypeStruct`s. Where it returns
         what `report` was given at some time in an earlier call with the same arguments, the experiment goes on from there, and all that
@@ -76,13 +77,13 @@ def fit(
     configs = tuple(with_action_hold(config, tables) for config in configs_per_seed(config, seeds))
     config = configs[0]
     check_config(env, config)
-    if config.quirks.misaligned_demo_actions and int(tables.lengths.min()) < 2:
-        raise UserError("misaligned_demo_actions needs demonstrations of at least 2 steps: turn it off or record others")
     if config.demo_reset_ratio == 0.0:
         tables = tables.replace(states=None)  # nobody needs them on the devices
 
     num_held = config.num_held
     tables = hold_demonstrations(tables, num_held)
+    if config.quirks.misaligned_demo_actions and int(tables.lengths.min()) < 2:
+        raise UserError("misaligned_demo_actions needs demonstrations of at least 2 steps: turn it off or record others")
     started = time.perf_counter()
     with contextlib.closing(programs_of(hold(env, num_held), configs, tables)) as programs:
         kept = nothing_kept(programs.shapes["state"].agent.average_actor)
@@ -139,7 +140,8 @@ def _train(result: Result, programs: Programs, report: Report) -> None:
         if result.steps_done >= min(programs.steps_at_random + (evaluations_done + 1) * config.eval_every, config.steps):
             _evaluate(result, programs, started)
         result.train_seconds = time.perf_counter() - started
-        asked = bool(report(result))
+        answer = report(result)
+        asked = isinstance(answer, bool | np.bool_) and bool(answer)  # not a tuple, say, of what several reporters return
         ends = asked or result.kept.all_confirmed
     if not result.rows:  # ended by `report` before the first evaluation
         _evaluate(result, programs, started)
@@ -181,7 +183,8 @@ def _played(result: Result, programs: Programs, policies: Policy, num_episodes: 
     """What became of fresh episodes, numpy leaves (S, num_episodes), lengths in environment steps; they are counted."""
     result.key, evaluation = programs.evaluate(result.key, policies, result.guidance, num_episodes)
     evaluation = gather(evaluation)
-    evaluation = evaluation.replace(length=evaluation.length * result.config.num_held)
+    lengths = np.minimum(evaluation.length * result.config.num_held, result.env.horizon)  # the horizon may cut the last decision short
+    evaluation = evaluation.replace(length=lengths)
     before = 0 if result.evaluation_steps is None else result.evaluation_steps
     result.evaluation_steps = before + np.asarray(evaluation.length).sum(axis=1, dtype=np.int64)
     return evaluation

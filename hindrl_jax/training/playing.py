@@ -174,8 +174,8 @@ class TrainedPolicies:
         return pictures, num_solved
 
     def _in_steps(self, evaluation: Evaluation) -> Evaluation:
-        """Lengths in steps of the environment, from lengths in decisions."""
-        return evaluation.replace(length=evaluation.length * self.num_held)
+        """Lengths in steps of the environment, from lengths in decisions, the last of which the horizon may cut short."""
+        return evaluation.replace(length=np.minimum(evaluation.length * self.num_held, self.env.horizon))
 
     def _evaluate_in_jax(self, env: Steppable, keys: Array, num_episodes: int) -> Evaluation:
         """All episodes of all policies in one compiled program."""

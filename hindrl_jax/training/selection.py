@@ -124,8 +124,10 @@ def choose(kept: Kept, last: Any, now: Moment, play: Play) -> tuple[Returned, Ev
     if kept.all_confirmed:
         chosen = kept.confirmed
     else:
-        scores = np.stack([_score(actor, play) for actor in candidates], axis=1)  # (S, K + 1)
-        scores[:, :NUM_KEPT][kept.success < 0.0] = -np.inf
+        scores = np.full((len(runs), NUM_KEPT + 1), -np.inf)
+        for index, there in enumerate([*(kept.success >= 0.0).T, np.ones(len(runs), bool)]):
+            if there.any():
+                scores[:, index] = np.where(there, _score(candidates[index], play), -np.inf)
         chosen = np.where(kept.confirmed >= 0, kept.confirmed, np.argmax(scores, axis=1))
 
     def of_chosen(values: np.ndarray, value_now: float) -> np.ndarray:

@@ -1,18 +1,24 @@
 """`hindrl train`, `hindrl sweep`, and what reads a run back. In process; the one training run is tiny and shared by the tests that read it."""
 
 import csv
+import dataclasses
 import json
+import shlex
 
 import jax
 import numpy as np
 import pytest
 from commands import TINY, refusal
+from toy_env import Corridor, corridor_demonstrations
 
+import hindrl_jax as hindrl
 from hindrl_jax import cli
 from hindrl_jax.cli.train_options import parse_train
 from hindrl_jax.runs.reader import load_run
+from hindrl_jax.tasks import registry
 
-SEED_FIELDS = {"seed", "final_success", "best_success", "env_steps_to_95", "updates_to_95", "seconds_to_95", "episode_length"}
+SEED_FIELDS = {"seed", "final_success", "best_success", "env_steps_to_95", "updates_to_95", "seconds_to_95", "episode_length", "evaluation_steps"}
+SEED_FIELDS |= {f"returned_{what}" for what in ("success", "length", "env_steps", "updates", "seconds")}
 TOTALS = {"updates_per_second", "env_steps_per_second", "compile_seconds", "train_seconds", "peak_memory_bytes"}
 
 
@@ -40,7 +46,7 @@ def test_run_directory_holds_what_it_promises(run):
     ]
     assert all(np.isfinite(float(value)) for row in rows for value in row.values())
     with np.load(run / "parameters.npz", allow_pickle=False) as archive:
-        assert archive["policy/params/Dense_0/kernel"].shape == (2, 40, 8)
+        assert archive["policy/params/Dense_0/kernel"].shape == archive["last_policy/params/Dense_0/kernel"].shape == (2, 40, 8)
 
 
 def test_config_runs_again_and_other_flags_change_it(run, tmp_path):
@@ -52,6 +58,34 @@ def test_config_runs_again_and_other_flags_change_it(run, tmp_path):
             np.testing.assert_array_equal(first[name], second[name])
     spec, _ = parse_train(["--config", str(run / "config.json"), "--learning-rate", "0.5", "--seeds", "1"])
     assert (spec.config.agent.learning_rate, spec.seeds, spec.config.batch.batch_size) == (0.5, (5,), 16)
+
+
+def test_actions_are_held_as_the_config_says_which_notes_what_was_chosen(tmp_path, capsys, monkeypatch):
+    """For all settings alike, by demonstrations of 126 steps: twice, so that 63 decisions remain."""
+    monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
+    hindrl.register(Corridor)
+    env, demos, out = Corridor(horizon=150, width=125.0), tmp_path / "demos.hdf5", tmp_path / "sweep"
+    demonstrations = corridor_demonstrations((1.0,), env=env).replace(states=None)
+    hindrl.save_demonstrations(demos, demonstrations, env=env, env_args=dataclasses.asdict(env))
+    where = ["--env", "Corridor", "--horizon", "150", "--width", "125", "--demos", str(demos)]
+    sizes = shlex.split("--num-envs 2 --learning-starts 300 --steps 330 --eval-every 20 --eval-episodes 3 --updates-per-iteration 1")
+    more = shlex.split("--batch-size 16 --net-arch 8 --buffer-size 2000 --seed 3 --seeds 2")
+    cli.main(["sweep", "--over", "learning_rate=1e-3,2e-3", "--out", str(out), *where, *sizes, *more])
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "each action is held for 2 steps, so a demonstration of 126 steps takes 63 decisions" in printed
+    for rate in ("0.001", "0.002"):
+        folder = out / f"learning_rate={rate}"
+        saved = json.loads((folder / "config.json").read_text())["config"]
+        assert (saved["action_hold"], saved["agent"]["learning_rate"]) == (2, float(rate))
+        run = load_run(folder)
+        assert run.spec.config.action_hold == 2
+        played = run.play(jax.random.key(0), episodes=2)
+        pairs = played.actions.reshape(2, 75, 2, 2)
+        within = np.arange(75) < played.lengths[:, None] // 2
+        np.testing.assert_array_equal(pairs[within][:, 0], pairs[within][:, 1])
+        assert all(row["episode_length"] % 2 == 0 for row in run.evaluate(episodes=1))  # the horizon is even
+        rows = list(csv.DictReader((folder / "metrics.csv").read_text().splitlines()))
+        assert [int(row["env_steps"]) for row in rows] == [320, 320, 332, 332]  # 75 decisions of 2 steps at random, then 4 steps an iteration
 
 
 def test_sweep_leaves_a_run_for_each_setting(tmp_path, capsys):
@@ -136,6 +170,8 @@ def test_a_place_inside_a_file_is_refused(tmp_path, capsys):
 def test_eval_and_render_read_the_run_back(run, tmp_path, capsys):
     cli.main(["eval", str(run), "--episodes", "4", "--stochastic"])
     assert "4 episodes per seed" in capsys.readouterr().out
+    cli.main(["eval", str(run), "--episodes", "2", "--last"])
+    assert "2 episodes per seed" in capsys.readouterr().out
     film = tmp_path / "film.gif"
     cli.main(["render", str(run), "--to", str(film), "--seed", "6"])
     assert film.read_bytes().startswith(b"GIF89a")

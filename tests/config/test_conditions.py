@@ -45,6 +45,8 @@ OF_THE_HOST = {
     "steps": "ends the run; what schedules make of it is the business of their other ends",
     "eval_every": "how many iterations are run between evaluations",
     "eval_episodes": "how many episodes an evaluation plays; it does not lead back to the policy",
+    "stop_at": "ends the run",
+    "action_hold": "the programs are given another environment and other demonstrations, and count steps by it",
 }
 
 # Per field, values of which one at least is another than a base's.

@@ -137,6 +137,8 @@ BAD = [
     (TrainConfig, "learning_starts", [-1]),
     (TrainConfig, "demo_reset_ratio", [-0.1, 1.1, None]),
     (TrainConfig, "random_truncation", [-0.1, 1.0, None]),
+    (TrainConfig, "action_hold", [0, -1, 2.5]),
+    (TrainConfig, "stop_at", [0.0, -0.1, 1.01]),
     (TrainConfig, "agent_resets", [(0.0,), (1.0,), (0.5, 0.5), (0.6, 0.3), (0.5, "1"), 0.5, None]),
     (TrainConfig, "demo_reset_curriculum", [-0.1, 1.1, 0.5]),  # 0.5 without resets to demonstrated states
     (TrainConfig, "bc_warm_start", [-1, 0.5]),

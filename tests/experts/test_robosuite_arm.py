@@ -110,13 +110,14 @@ def test_a_reset_leaves_nothing_behind(arm):
 # --- episodes
 
 
-def test_host_loop_plays_as_the_compiled_one_does():
+@pytest.mark.parametrize("num_held", [1, 4])
+def test_host_loop_plays_as_the_compiled_one_does(num_held):
     """With the same arm on both sides: every row, the padding included, but for actions, whose padding is 0 on the host."""
     env = KinematicReach(num_waypoints=1, position_tolerance=0.1, rotation_tolerance=0.3, horizon=19)
     act = expert_act(ReachExpert(randomness_scale=0.05), env)
-    expected = jax.jit(lambda key: play(key, env, act, 6))(jax.random.key(4))
+    expected = jax.jit(lambda key: play(key, env, act, 6, num_held))(jax.random.key(4))
     arm, jitted = KinematicArm(), jax.jit(act)
-    found = stacked([play_episode(key_episode, env, arm, jitted) for key_episode in jax.random.split(jax.random.key(4), 6)])
+    found = stacked([play_episode(key_episode, env, arm, jitted, num_held) for key_episode in jax.random.split(jax.random.key(4), 6)])
     lengths = np.asarray(expected.lengths)
     assert set(np.asarray(expected.terminated).tolist()) == {False, True}
     padding = np.arange(env.horizon)[None] >= lengths[:, None]

@@ -77,7 +77,8 @@ def test_an_ablation_leaves_runs_and_tables(finished):
     assert sorted(str(file.relative_to(finished)) for file in finished.glob("*")) == ["ablation.csv", "ablation.md", "ablation.png", "small"]
     assert sorted(file.name for file in finished.glob("small/*")) == ["default", "n-step-1"]
     baseline, option = (read_spec(finished / "small" / name) for name in ("default", "n-step-1"))
-    assert (baseline.config, option.config) == (TINY, dataclasses.replace(TINY, batch=dataclasses.replace(TINY.batch, n_step=1)))
+    held = dataclasses.replace(TINY, action_hold=1)  # which was chosen
+    assert (baseline.config, option.config) == (held, dataclasses.replace(held, batch=dataclasses.replace(TINY.batch, n_step=1)))
     assert (baseline.seeds, baseline.demos, baseline.env.horizon) == ((7, 8), "1", 20)
     for name in ("default", "n-step-1"):
         evaluations = list(csv.DictReader((finished / "small" / name / "metrics.csv").read_text().splitlines()))

@@ -92,9 +92,30 @@ def test_an_episode_ends_at_its_goal_with_its_true_last_observation(simulators, 
     assert outcome.truncated.tolist() == [False, True, False]  # the second, at the horizon
 
 
-def test_equal_seeds_give_equal_episodes_in_processes_of_their_own_as_well(simulators):
+@pytest.mark.parametrize("says", ["is_success", "reward"])
+def test_held_actions_are_steps_with_the_same_action_up_to_the_goal(simulators, says):
+    """Two points: the first moves towards its goal by a third of the way at a time, the second stands still, to its horizon of 10 steps."""
+    env = hindrl.make(POINT, says=says)
+    held, stepped = env.stepper(2, num_held=4), simulators(env, 2)
+    observation, goal = held.begin(np.array([4, 5]))
+    stepped.begin(np.array([4, 5]))
+    wish = np.clip((goal - observation[:, 3:]) / SPEED / 3, -1, 1) * 2 * np.array([[1], [0]])
+    assert (np.linalg.norm(goal - observation[:, 3:], axis=1) > 3 * 0.2).all()
+    steps = [stepped.step(wish, begin_anew=False) for _ in range(3)]
+    outcome = held.step(wish)
+    assert [bool(step.success[0]) for step in steps] == [False, False, True]
+    assert outcome.success.tolist() == outcome.terminated.tolist() == [True, False]
+    np.testing.assert_array_equal(outcome.next_observation[0], steps[-1].next_observation[0])  # a fourth step would lead beyond
+    np.testing.assert_array_equal(outcome.next_observation[1], observation[1])
+    truncated = [held.step(0.0 * wish).truncated[1] for _ in range(2)]
+    assert truncated == [False, True]  # after 8 and 10 steps
+    held.close()
+
+
+@pytest.mark.parametrize("num_held", [1, 3])
+def test_equal_seeds_give_equal_episodes_in_processes_of_their_own_as_well(simulators, num_held):
     env = hindrl.make(POINT)
-    both = [simulators(env, 2), simulators(dataclasses.replace(env, vectorization="async"), 2)]
+    both = [simulators(env, 2, num_held=num_held), simulators(dataclasses.replace(env, vectorization="async"), 2, num_held=num_held)]
     begun = [one.begin(np.array([1, 2])) for one in both]
     np.testing.assert_array_equal(begun[0][0], begun[1][0])
     for step in range(12):  # beyond the horizon

@@ -29,15 +29,18 @@ def trained(env, demonstrations, **changes):
     return TrainedPolicies(env, config, *jax.vmap(begin)(jax.random.split(jax.random.key(0), 2)))
 
 
-def test_evaluations_are_alike_wherever_an_environment_is_stepped():
+@pytest.mark.parametrize(("num_held", "lengths"), [(1, {2, 3, 4, 5}), (2, {2, 4, 5})])
+def test_evaluations_are_alike_wherever_an_environment_is_stepped(num_held, lengths):
+    """Lengths are in steps, whole decisions of them but for the horizon."""
     keys = jax.random.split(jax.random.key(1), 2)
-    outcomes = [trained(env, corridor_demonstrations()).evaluate(keys, 5) for env in (Corridor(), HostCorridor())]
+    outcomes = [trained(env, corridor_demonstrations(), action_hold=num_held).evaluate(keys, 5) for env in (Corridor(), HostCorridor())]
     for outcome in outcomes:
+        assert set(outcome.length.flat) <= lengths
         assert outcome.success.shape == outcome.length.shape == (2, 5)
         assert (outcome.success | (outcome.length == 5)).all()
         assert (outcome.length >= 2).all()  # 3 are walked in no less than 2 steps of 2
     assert outcomes[0].success.any() == outcomes[1].success.any()
-    again = trained(HostCorridor(), corridor_demonstrations()).evaluate(keys, 5)
+    again = trained(HostCorridor(), corridor_demonstrations(), action_hold=num_held).evaluate(keys, 5)
     np.testing.assert_array_equal(again.length, outcomes[1].length)
     assert all(stepper.closed for stepper in HostCorridor.made)
 
@@ -45,23 +48,26 @@ def test_evaluations_are_alike_wherever_an_environment_is_stepped():
 def test_what_steps_neither_in_jax_nor_many_at_once_is_played_by_the_tasks_own_player(monkeypatch):
     """With closed_form in the place of robosuite."""
 
-    def play(key, env, act, num_episodes):
-        played.append((env.backend, num_episodes))
-        return player(dataclasses.replace(env, backend="closed_form"), act, num_episodes)(key)
+    def play(key, env, act, num_episodes, num_held):
+        played.append((env.backend, num_episodes, num_held))
+        return player(dataclasses.replace(env, backend="closed_form"), act, num_episodes, num_held)(key)
 
     played, reported = [], []
     env = hindrl.make("FixedParameterizedReach", num_waypoints=1, horizon=4)
     demonstration = hindrl.record_demonstrations(dataclasses.replace(env, position_tolerance=9.0, rotation_tolerance=9.0), 1)
     elsewhere = dataclasses.replace(env, backend="robosuite")
     monkeypatch.setitem(TASKS, env.name, dataclasses.replace(TASKS[env.name], player=play))
-    policies = trained(elsewhere, demonstration)
+    policies = trained(elsewhere, demonstration, action_hold=3)
     outcome = policies.evaluate(jax.random.split(jax.random.key(1), 2), 3, reported.append)
     assert outcome.length.tolist() == [[4] * 3] * 2
     assert reported == [1, 2, 3, 4, 5, 6]
-    assert played == [("robosuite", 1)] * 6
+    assert played == [("robosuite", 1, 3)] * 6
     episodes = policies.play(jax.random.key(0), 1, 2)
     expected = dataclasses.replace(policies, env=env).play(jax.random.key(0), 1, 2)
     jax.tree.map(np.testing.assert_array_equal, episodes, expected)
+    np.testing.assert_array_equal(episodes.actions[:, 1], episodes.actions[:, 0])
+    np.testing.assert_array_equal(episodes.actions[:, 2], episodes.actions[:, 0])
+    assert (episodes.actions[:, 3] != episodes.actions[:, 0]).any()
 
 
 def test_what_has_no_states_is_not_played_with_them():

@@ -5,6 +5,7 @@ import pytest
 from tiny import CONFIG, ENV
 
 from hindrl_jax.training.result import Result, Row
+from hindrl_jax.training.selection import Returned
 
 
 def row(seed, env_steps, success):
@@ -19,16 +20,28 @@ def test_summary_takes_the_first_evaluation_at_95_percent():
         seeds=(1, 2),
         guidance=None,
         state=None,
+        kept=None,
         rows=rows,
         compile_seconds=1.0,
         train_seconds=3.0,
         env_steps=300,
         final_success=np.array([0.91, 0.8]),
         final_length=np.array([8.0, 10.0]),
+        evaluation_steps=np.array([700, 800]),
+        returned=Returned(
+            actor=None,
+            success=np.array([0.97, 0.75]),
+            length=np.array([7.0, 9.0]),
+            env_steps=np.array([200, 300]),
+            updates=np.array([20, 30]),
+            seconds=np.array([2.0, 3.0]),
+        ),
     )
     reached, never = result.summaries()
     assert (reached.env_steps_to_95, reached.updates_to_95, reached.seconds_to_95) == (200, 20, 2.0)
     assert (reached.best_success, reached.final_success, reached.episode_length) == (0.95, 0.91, 8.0)
     assert (never.env_steps_to_95, never.updates_to_95, never.seconds_to_95) == (None, None, None)
     assert never.best_success == 0.8  # the final evaluation counts
+    assert (reached.returned_success, reached.returned_length, reached.evaluation_steps) == (0.97, 7.0, 700)
+    assert (never.returned_env_steps, never.returned_updates, never.returned_seconds) == (300, 30, 3.0)
     assert result.latest_success() == pytest.approx(0.8)

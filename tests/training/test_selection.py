@@ -1,0 +1,241 @@
+"""Which policies of a run are kept, which of them is returned, and what ends a run."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+import tiny
+from toy_env import Corridor, corridor_demonstrations
+
+import hindrl_jax as hindrl
+from hindrl_jax.core.rollout import Evaluation
+from hindrl_jax.runs.checkpoints import Checkpoints
+from hindrl_jax.training.selection import CHOICE_ROUNDS, NUM_KEPT, Moment, choose, keep, nothing_kept
+
+NOBODY = np.zeros(1, bool)
+
+
+def policies(*names):
+    """Parameters of S actors, each of which is a number that it is known by."""
+    return {"name": np.array(names, np.float32)}
+
+
+def evaluation(success, length=10.0):
+    """Of one run: 10 episodes."""
+    return Evaluation(success=np.arange(10)[None] < round(10 * success), length=np.full((1, 10), length))
+
+
+def kept_of(*outcomes, confirmed=()):
+    """One run, whose t-th policy, from 1, is named t and evaluated at step 100 t."""
+    kept = nothing_kept(policies(0.0))
+    for t, (success, length) in enumerate(outcomes, start=1):
+        kept = keep(kept, policies(t), evaluation(success, length), np.array([t in confirmed]), Moment(100 * t, 10 * t, float(t)))
+    return kept
+
+
+def names(kept):
+    """Of what is kept, in order of time."""
+    return sorted(kept.actor["name"][kept.success >= 0.0].tolist())
+
+
+def test_the_worst_is_replaced_by_what_is_as_good():
+    outcomes = [(0.5, 10.0), (0.2, 10.0), (0.8, 10.0), (0.6, 10.0)]
+    assert len(outcomes) == NUM_KEPT
+    assert names(kept_of(*outcomes)) == [1, 2, 3, 4]
+    assert names(kept_of(*outcomes, (0.1, 5.0))) == [1, 2, 3, 4]
+    kept = kept_of(*outcomes, (0.3, 12.0))
+    assert names(kept) == [1, 3, 4, 5]
+    (newest,) = np.flatnonzero(kept.actor["name"][0] == 5)
+    assert (kept.success[0, newest], kept.length[0, newest], kept.env_steps[0, newest]) == (0.3, 12.0, 500)
+    assert (kept.updates[0, newest], kept.seconds[0, newest]) == (50, 5.0)
+    assert names(kept_of(*outcomes, (0.3, 12.0), (0.9, 12.0))) == [1, 3, 4, 6]
+
+
+def test_of_equal_policies_those_with_shorter_episodes_are_kept_and_then_the_newer():
+    outcomes = [(0.5, 10.0), (0.5, 12.0), (0.5, 11.0), (0.5, 9.0)]
+    assert names(kept_of(*outcomes, (0.5, 11.5))) == [1, 3, 4, 5]
+    assert names(kept_of(*outcomes, (0.5, 12.5))) == [1, 2, 3, 4]
+    assert names(kept_of(*outcomes, (0.5, 12.0))) == [1, 3, 4, 5]
+
+
+def test_a_confirmed_policy_is_kept_always_and_ends_the_changes_of_its_run():
+    outcomes = [(0.9, 10.0)] * 4
+    kept = kept_of(*outcomes, (0.8, 99.0), confirmed=(5,))
+    assert kept.actor["name"][0, kept.confirmed[0]] == 5
+    assert kept.all_confirmed
+    assert not kept_of(*outcomes).all_confirmed
+    later = keep(kept, policies(6), evaluation(1.0), np.array([True]), Moment(600, 60, 6.0))
+    jax.tree.map(np.testing.assert_array_equal, later, kept)
+
+
+def test_runs_are_kept_apart():
+    kept = nothing_kept(policies(0.0, 0.0))
+    both = jax.tree.map(lambda a, b: np.concatenate([a, b]), evaluation(0.3), evaluation(0.7))
+    kept = keep(kept, policies(1, 2), both, np.array([False, True]), Moment(1, 1, 1.0))
+    assert kept.confirmed.tolist() == [-1, 0]
+    assert not kept.all_confirmed
+    kept = keep(kept, policies(3, 4), both, np.array([False, False]), Moment(2, 2, 2.0))
+    assert sorted(kept.actor["name"][0].tolist()) == [0, 0, 1, 3]
+    assert sorted(kept.actor["name"][1].tolist()) == [0, 0, 0, 2]
+
+
+class Player:
+    """Plays with policies of which the success and the length are known, by their names; later rounds may have others."""
+
+    def __init__(self, *rounds):
+        self.rounds, self.played = rounds, []
+
+    def __call__(self, actor):
+        (name,) = actor["name"].tolist()
+        outcomes = self.rounds[min(self.played.count(name), len(self.rounds) - 1)]
+        self.played.append(name)
+        return evaluation(*outcomes[name])
+
+
+NOW = Moment(1000, 100, 10.0)
+KEPT = [(0.9, 10.0), (0.8, 10.0)]
+
+
+@pytest.mark.parametrize(
+    ("fresh", "chosen", "steps"),
+    [
+        ({0: (1.0, 1.0), 1: (0.5, 10.0), 2: (0.6, 10.0), 9: (0.4, 10.0)}, 2, 200),  # not the one whose evaluation was best
+        ({0: (1.0, 1.0), 1: (0.5, 10.0), 2: (0.6, 10.0), 9: (0.7, 10.0)}, 9, 1000),  # the last
+        ({0: (1.0, 1.0), 1: (0.6, 9.0), 2: (0.6, 10.0), 9: (0.6, 11.0)}, 1, 100),  # the quickest of equals
+        ({0: (1.0, 1.0), 1: (0.6, 1.0), 2: (0.7, 999.0), 9: (0.6, 1.0)}, 2, 200),  # no number of steps outweighs an episode
+    ],
+)
+def test_the_best_in_fresh_episodes_is_returned(fresh, chosen, steps):
+    """Slots without a policy, which hold zeros, would be best, and are not played."""
+    player = Player(fresh)
+    returned, last = choose(kept_of(*KEPT), policies(9), NOW, player)
+    assert 0.0 not in player.played
+    assert returned.actor["name"].tolist() == [chosen]
+    assert (returned.env_steps.tolist(), returned.updates.tolist(), returned.seconds.tolist()) == ([steps], [steps // 10], [steps / 100])
+    assert (returned.success.tolist(), returned.length.tolist()) == ([fresh[chosen][0]], [fresh[chosen][1]])
+    assert last.success.mean() == fresh[9][0]
+
+
+def test_what_is_reported_comes_from_other_episodes_than_the_choice():
+    lucky = {0: (0.0, 1.0), 1: (1.0, 10.0), 2: (0.6, 10.0), 9: (0.5, 10.0)}
+    later = {1: (0.3, 20.0), 9: (0.4, 10.0)}
+    player = Player(*[lucky] * CHOICE_ROUNDS, later)
+    returned, last = choose(kept_of(*KEPT), policies(9), NOW, player)
+    assert returned.actor["name"].tolist() == [1]
+    assert (returned.success.tolist(), returned.length.tolist(), last.success.mean()) == ([0.3], [20.0], 0.4)
+
+
+def test_what_is_confirmed_is_returned_without_a_choice():
+    fresh = {5: (0.2, 10.0), 9: (0.9, 10.0)}
+    player = Player(fresh)
+    returned, _ = choose(kept_of(*[(0.9, 10.0)] * 4, (0.8, 99.0), confirmed=(5,)), policies(9), NOW, player)
+    assert returned.actor["name"].tolist() == [5]
+    assert returned.env_steps.tolist() == [500]
+    assert player.played == [5, 9]
+
+
+def test_beside_runs_that_choose_a_confirmed_policy_is_returned():
+    kept = jax.tree.map(lambda a, b: np.concatenate([a, b]), kept_of(*KEPT), kept_of(*KEPT, confirmed=(1,)))
+
+    def play(actor):
+        return Evaluation(success=np.arange(10) < actor["name"][:, None], length=np.ones((2, 10)))
+
+    returned, _ = choose(kept, policies(9, 9), NOW, play)
+    assert returned.actor["name"].tolist() == [9, 1]
+    assert returned.env_steps.tolist() == [1000, 100]
+
+
+def test_slots_that_only_other_runs_have_filled_are_not_chosen():
+    """They hold zeros, which would be best."""
+    kept = jax.tree.map(lambda a, b: np.concatenate([a, b]), kept_of(*KEPT[:1]), kept_of(*KEPT))
+
+    def play(actor):
+        return Evaluation(success=np.arange(10) < np.where(actor["name"] == 0, 10, actor["name"])[:, None], length=np.ones((2, 10)))
+
+    returned, _ = choose(kept, policies(0.5, 0.5), NOW, play)
+    assert returned.actor["name"].tolist() == [1, 2]
+
+
+# --------------------------------------------------------------------------------------------------------------------------- in a whole run
+
+ENV = Corridor()
+"""It is solved by hardly any effort: a policy that knows nothing walks at half the speed, and arrives."""
+CONFIG = dataclasses.replace(tiny.CONFIG, steps=400, learning_starts=20, eval_every=20, action_hold=1, stop_at=0.9)
+SEEDS = (3, 4)
+
+
+class Killed(Exception):
+    pass
+
+
+def fit(config=CONFIG, **choices):
+    return hindrl.fit(ENV, corridor_demonstrations(), config, seeds=SEEDS, **choices)
+
+
+@pytest.fixture(scope="module")
+def solved():
+    return fit()
+
+
+def test_a_run_ends_when_all_its_policies_are_confirmed(solved):
+    assert solved.kept.all_confirmed
+    assert solved.env_steps < CONFIG.steps
+    assert solved.env_steps == solved.rows[-1].env_steps
+    for index in range(len(SEEDS)):
+        confirming = [row for row in solved.rows[index :: len(SEEDS)] if row.env_steps == solved.returned.env_steps[index]]
+        assert [row.success >= 0.9 for row in confirming] == [True]
+        slot = solved.kept.confirmed[index]
+        for found, kept in zip(jax.tree.leaves(solved.returned.actor), jax.tree.leaves(solved.kept.actor), strict=True):
+            np.testing.assert_array_equal(found[index], kept[index, slot])
+    assert max(solved.returned.env_steps) == solved.env_steps
+    assert (solved.returned.success > 0.5).all()
+
+
+def test_evaluations_are_counted(solved):
+    """Those along the run, those that confirm, and two of the returned and the last policies: episodes of 2 to 5 steps."""
+    evaluations = len(solved.rows) // len(SEEDS)
+    fewest, most = evaluations * CONFIG.eval_episodes + 300, evaluations * (CONFIG.eval_episodes + 100) + 200
+    assert (solved.evaluation_steps >= 2 * fewest).all()
+    assert (solved.evaluation_steps <= 5 * most).all()
+    assert [summary.evaluation_steps for summary in solved.summaries()] == solved.evaluation_steps.tolist()
+
+
+def test_a_run_goes_on_where_it_was_stopped_with_the_policies_that_were_kept(solved, tmp_path):
+    """Killed when its policies were confirmed, before the end."""
+    checkpoints = Checkpoints(tmp_path, seconds=0)
+
+    def report(result):
+        checkpoints.save_when_due(result)
+        if result.kept.all_confirmed:
+            raise Killed
+
+    with pytest.raises(Killed):
+        fit(report=report)
+    resumed = fit(restore=Checkpoints(tmp_path).restore)
+    assert resumed.env_steps == solved.env_steps
+    for name in ("kept", "returned"):
+        found, expected = (getattr(result, name).replace(seconds=0.0) for result in (resumed, solved))
+        jax.tree.map(np.testing.assert_array_equal, found, expected)
+    np.testing.assert_array_equal(resumed.evaluation_steps, solved.evaluation_steps)
+
+
+def test_a_report_that_returns_true_ends_the_run_which_can_be_saved(tmp_path):
+    demonstrations = hindrl.record_demonstrations(tiny.ENV, 2)
+    config = dataclasses.replace(tiny.CONFIG, steps=400, eval_every=100)
+    first, second = [], []
+    result = hindrl.fit(tiny.ENV, demonstrations, config, report=lambda result: bool(first.append(result.env_steps)) or len(first) == 3)
+    # Reports: before anything happened, after two chunks, and at the end.
+    assert len(first) == 4
+    assert result.env_steps == first[2] < 100
+    assert len(result.rows) == 1  # it was not evaluated before
+    assert result.returned is not None
+    (saved,) = hindrl.save_run(tmp_path, result)["seeds"]
+    assert (saved["returned_env_steps"], saved["final_success"]) == (result.env_steps, result.final_success[0])
+    run, last = hindrl.load_run(tmp_path), hindrl.load_run(tmp_path, last=True)
+    assert run.spec.config == dataclasses.replace(config, action_hold=1)  # which was chosen
+    for policy, actor in ((run.policies, result.returned.actor), (last.policies, result.state.agent.average_actor)):
+        jax.tree.map(np.testing.assert_array_equal, policy.actor, actor)
+    # What is merely not empty, such as what several reporters return together, ends nothing.
+    hindrl.fit(tiny.ENV, demonstrations, dataclasses.replace(config, steps=120), report=lambda result: (second.append(result.env_steps), None))
+    assert second[-1] == 120
