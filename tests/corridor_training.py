@@ -26,7 +26,7 @@ def make_config(**changes):
         learning_starts=NUM_ENVS * HORIZON,
         buffer_size=30_000,
         steps=102,
-        batch=BatchConfig(batch_size=16, hindrl_sampling_strategy="joint_union", reach_zero=66),
+        batch=BatchConfig(batch_size=16, max_demo_ratio=0.25, hindrl_sampling_strategy="joint_union", reach_zero=66),
         goal=GoalConfig(epsilon_steps=1, epsilon_deviations=1.0, epsilon_filtering=True),
         agent=AgentConfig(net_arch=(8,), num_quantiles=5, top_quantiles_to_drop_per_net=1, target_entropy=-1000.0, final_target_entropy=1000.0),
     )

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hindrl_jax.base.types import Transition
-from hindrl_jax.config import AgentConfig, TrainConfig
+from hindrl_jax.config import AgentConfig, QuirksConfig, TrainConfig
 from hindrl_jax.core import agent as agents
 from hindrl_jax.core.inputs import InputScale, network_inputs
 from hindrl_jax.core.networks import apply_critics
@@ -19,6 +19,8 @@ from hindrl_jax.core.schedules import schedule
 CONFIG = TrainConfig(
     agent=AgentConfig(
         net_arch=(16,),
+        layer_norm=False,
+        clip_targets=False,
         learning_rate=1e-2,
         num_quantiles=4,
         top_quantiles_to_drop_per_net=0,
@@ -30,7 +32,8 @@ CONFIG = TrainConfig(
         final_learning_rate=None,
         bc_weight=0.0,
         input_encoding="raw",
-    )
+    ),
+    quirks=QuirksConfig(bc_loss="squared"),
 )
 NUM_UPDATES = 400
 B = 32

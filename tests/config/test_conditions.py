@@ -13,7 +13,7 @@ import pytest
 from traced_programs import DEMONSTRATIONS, ENV, Program
 
 from hindrl_jax.base.types import Transition
-from hindrl_jax.config import AgentConfig, BatchConfig, TrainConfig, without_effect
+from hindrl_jax.config import AgentConfig, BatchConfig, GoalConfig, TrainConfig, without_effect
 from hindrl_jax.config.conditions import CONDITIONS
 from hindrl_jax.core import agent
 from hindrl_jax.core.batch import num_demo_rows
@@ -28,6 +28,7 @@ SMALL = TrainConfig(
     learning_starts=20,
     buffer_size=40,
     batch=BatchConfig(batch_size=8, n_step=2),
+    goal=GoalConfig(epsilon_steps=0),
     agent=AgentConfig(net_arch=(4,), num_quantiles=3, top_quantiles_to_drop_per_net=1),
 )
 
@@ -93,7 +94,7 @@ VALUES = {
     "actor_average_rate": (0.1, 0.2),
     "actor_average_span": (0.5, 1.0),
     "initial_alpha": (0.1, 0.2),
-    "target_entropy": (-2.0, -3.0),
+    "target_entropy": (-3.0, -5.0),
     "final_target_entropy": (-4.0, -5.0),
     "exploration_noise": (0.2, 0.3),
     "target_noise": (0.3, 0.4),

@@ -21,6 +21,7 @@ READ_THROUGH = {
     "union_sampling_ratio": "sources",
     "strategy_mixture": "sources",
     "num_quantiles": "critic_outputs",
+    "updates_per_iteration": "num_updates",
     "final_achieved_goal_ratio": "has_achieved_goals",
 }
 

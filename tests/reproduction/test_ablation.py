@@ -18,7 +18,6 @@ from hindrl_jax.reproduction.ablation import TASKS, cells_of
 from hindrl_jax.reproduction.cells import Task
 from hindrl_jax.reproduction.options import OPTIONS
 from hindrl_jax.runs.spec import read_spec
-from hindrl_jax.tasks.presets import preset
 
 TINY = dataclasses.replace(CONFIG, steps=80, eval_episodes=100)
 SMALL = Task("FixedGridPickAndPlace", (("num_objects", 1), ("size", 4), ("random_box_size", 1), ("horizon", 20)), 1)
@@ -31,7 +30,7 @@ def tiny():
     """One small task and a small recipe in place of the real ones."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ablation, "TASKS", {"small": SMALL})
-        patch.setattr(ablation, "preset", lambda algo, *, env: TINY)
+        patch.setattr(ablation, "RECIPE", TINY)
         yield
 
 
@@ -65,12 +64,6 @@ def test_the_tasks_are_those_of_the_grid():
         ("fixed-5", "FixedGridPickAndPlace, num_objects 2, 5 demonstrations"),
         ("random-50", "GridPickAndPlace, num_objects 2, 50 demonstrations"),
     ]
-
-
-def test_options_are_compared_until_the_agent_is_reset():
-    recipe = preset("hindrl", env="FixedGridPickAndPlace")
-    assert ablation._until_reset(recipe) == dataclasses.replace(recipe, steps=80_000, agent_resets=())
-    assert ablation._until_reset(TINY) == TINY
 
 
 def test_an_ablation_leaves_runs_and_tables(finished):

@@ -11,8 +11,7 @@ from hindrl_jax.base.errors import UserError
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.core import train as training
 from hindrl_jax.core.guidance import guidance
-from hindrl_jax.reproduction.options import BASELINE, OPTIONS, Group, Option, apply, half_of_the_run
-from hindrl_jax.tasks.presets import preset
+from hindrl_jax.reproduction.options import BASELINE, OPTIONS, RECIPE, Group, Option, apply, half_of_the_run
 from hindrl_jax.tasks.registry import make
 from hindrl_jax.training.prioritised import sampler_for
 from hindrl_jax.training.recording import record_demonstrations
@@ -20,7 +19,7 @@ from hindrl_jax.training.recording import record_demonstrations
 
 @pytest.mark.parametrize("option", OPTIONS, ids=lambda option: option.name)
 def test_every_option_changes_each_of_its_fields_and_nothing_else(option):
-    config = preset("hindrl", env="FixedGridPickAndPlace")
+    config = RECIPE
     before, after = (dataclasses.asdict(each) for each in (config, apply(config, option)))
     for part in ("batch", "goal", "agent", "priority", "quirks"):
         before |= {f"{part}.{name}": value for name, value in before.pop(part).items()}
@@ -42,7 +41,7 @@ def demonstration():
 def test_every_option_makes_a_program(option, demonstration):
     """Traced, not compiled: what the config's own checks let pass, the training must not refuse."""
     env, episodes = demonstration
-    config = apply(preset("hindrl", env=env), option)
+    config = apply(RECIPE, option)
 
     def start_and_learn(key):
         data, sampler = guidance(episodes, env, config), sampler_for(env, config)
@@ -65,7 +64,7 @@ def test_options_have_names_for_directories_of_their_own():
 
 def test_the_summaries_speak_of_the_recipe_as_it_is():
     """They say "in place of 5" and the like by hand, so whoever changes the recipe must look at them."""
-    recipe = preset("hindrl")
+    recipe = RECIPE
     batch, agent = recipe.batch, recipe.agent
     assert (batch.n_step, batch.gamma, batch.max_demo_ratio, batch.relabelled_per_original, batch.batch_size) == (5, 0.98, 0.25, 0.25, 256)
     assert (agent.num_critics, agent.target_update_rate, agent.bc_weight, agent.initial_alpha) == (2, 0.02, 0.01, 0.002)
