@@ -28,7 +28,14 @@ def make_config(**changes):
         steps=102,
         batch=BatchConfig(batch_size=16, max_demo_ratio=0.25, hindrl_sampling_strategy="joint_union", reach_zero=66),
         goal=GoalConfig(epsilon_steps=1, epsilon_deviations=1.0, epsilon_filtering=True),
-        agent=AgentConfig(net_arch=(8,), num_quantiles=5, top_quantiles_to_drop_per_net=1, target_entropy=-1000.0, final_target_entropy=1000.0),
+        agent=AgentConfig(
+            net_arch=(8,),
+            layer_norm=False,
+            num_quantiles=5,
+            top_quantiles_to_drop_per_net=1,
+            target_entropy=-1000.0,
+            final_target_entropy=1000.0,
+        ),
     )
     return dataclasses.replace(config, **changes)
 

@@ -31,10 +31,10 @@ def test_guidance_by_default():
     data = guidance_of()
     assert goals_of(data.goals) == [0.0, 1.0, 2.0, 3.0, 4.0, 0.0, 2.0, 4.0]
     assert goals_of(data.behavioural_goals) == [4.0, 4.0]
-    assert data.epsilon.tolist() == [0.0]
-    # Root mean square of the 5 + 3 goals: (0 + 1 + 4 + 9 + 16 + 0 + 4 + 16) / 8 = 2.5^2.
-    np.testing.assert_allclose(data.scale.goal, [2.5], rtol=1e-6)
-    np.testing.assert_allclose(data.scale.observation[2], 2.5, rtol=1e-6)
+    np.testing.assert_allclose(data.epsilon, [8 / 6], rtol=1e-6)  # four steps of 1 and two of 2
+    # The mean of the 5 + 3 goals is 2, and their variance (4 + 1 + 0 + 1 + 4 + 4 + 0 + 4) / 8 = 1.5^2.
+    np.testing.assert_allclose([data.scale.goal[0], data.scale.goal_centre[0]], [1.5, 2.0], rtol=1e-6)
+    np.testing.assert_allclose(data.scale.observation[2], 1.5, rtol=1e-6)
     demonstrations = data.demonstrations
     assert demonstrations.desired_goals.tolist() == [[4.0], [4.0]]
     given = corridor_demonstrations(TWO_SPEEDS)
@@ -129,7 +129,7 @@ def test_epsilon_and_filtering_follow_the_config():
     assert data.epsilon[0] == pytest.approx(8 / 6 + 2 * (2 / 9) ** 0.5)  # 2.28
     assert goals_of(data.goals) == [0.0, 3.0, 0.0, 4.0]
     # With epsilon 0 only equal neighbours are dropped, and not even those under the strict test.
-    assert goals_of(guidance_of(GoalConfig(epsilon_filtering=True)).goals) == [0.0, 1.0, 2.0, 3.0, 4.0, 0.0, 2.0, 4.0]
+    assert goals_of(guidance_of(GoalConfig(epsilon_steps=0, epsilon_filtering=True)).goals) == [0.0, 1.0, 2.0, 3.0, 4.0, 0.0, 2.0, 4.0]
     assert guidance_of(GoalConfig(epsilon=0.25)).epsilon.tolist() == [0.25]
 
 

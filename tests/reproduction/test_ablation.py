@@ -83,7 +83,7 @@ def test_an_ablation_leaves_runs_and_tables(finished):
     assert "2 seeds from 7, 80 environment steps each" in text
     assert f"## small: {SMALL.title()}\n" in text
     assert text.index("| default |") < text.index(f"| *{OPTION.group}* |") < text.index(f"| {OPTION.name} |")
-    assert text.endswith(f"| default | the default recipe until its agent is reset |\n| {OPTION.name} | {OPTION.summary} |\n")
+    assert text.endswith(f"| default | the recipe as it is |\n| {OPTION.name} | {OPTION.summary} |\n")
 
 
 def test_what_is_finished_is_not_trained_again(finished, capsys):

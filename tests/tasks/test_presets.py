@@ -104,17 +104,31 @@ def test_original_preset_differs_from_the_thesis_by_the_quirks_alone(env, more):
     } | more
 
 
-def test_default_recipes_differ_by_family_and_the_grid_has_the_defaults_of_the_config():
-    with_reset = dataclasses.replace(TrainConfig(), steps=240_000, agent_resets=(1 / 3,))
-    assert preset("hindrl", env="GridPickAndPlace") == preset("hindrl") == with_reset
-    fixed, relabelling = preset("hindrl", env="FixedParameterizedReach"), preset("hindrl", env="ParameterizedReach")
-    assert preset("hindrl", env=make("ParameterizedReach", num_waypoints=1)) == relabelling
-    assert len({TrainConfig(), fixed, relabelling}) == 3  # observations are relabelled there, in part with demonstrated states
-    assert relabelling.batch.hindrl_sampling_strategy == "joint_union"
-    assert preset("bc", env="ParameterizedReach") == preset("bc", env="FixedParameterizedReach")
-    assert relabelling.demo_reset_ratio > 0.0
-    assert preset("tqcfd", env="ParameterizedReach") == preset("tqcfd", env="FixedParameterizedReach")
+TASKS = ["GridPickAndPlace", "FixedGridPickAndPlace", "FixedParameterizedReach", "ParameterizedReach", "gymnasium:FetchReach-v4"]
+
+
+def test_there_is_one_recipe_and_what_differs_follows_from_what_an_environment_does():
+    recipes = {name: flat(preset("hindrl", env=name)) for name in TASKS}
+    grid = recipes["GridPickAndPlace"]
+    differences = {name: {field: value for field, value in recipe.items() if value != grid[field]} for name, recipe in recipes.items()}
+    many_tasks = {"relabelled_per_original": 1.0, "hindrl_sampling_strategy": "joint_union"}
+    assert preset("hindrl", env="GridPickAndPlace") == TrainConfig()
+    assert differences == {
+        "GridPickAndPlace": {},
+        "FixedGridPickAndPlace": {},
+        "FixedParameterizedReach": {},
+        "ParameterizedReach": many_tasks | {"behavioural_goals": "task"},
+        "gymnasium:FetchReach-v4": many_tasks | {"behavioural_goals": "environment", "epsilon": 0.0289},  # 0.05 over the root of 3
+    }
     assert preset("tqcfd", env="ParameterizedReach").batch.relabelled_per_original == 0.0
+
+
+@pytest.mark.parametrize("algo", ["bc", "tqcfd", "hindrl", "smooth-hindrl"])
+def test_a_task_of_another_name_has_the_same_recipe(algo):
+    for name in ("GridPickAndPlace", "FixedParameterizedReach", "ParameterizedReach"):
+        known = make(name)
+        stranger = dataclasses.dataclass(frozen=True)(type("Stranger", (type(known),), {"name": "Stranger"}))()
+        assert preset(algo, env=stranger) == preset(algo, env=known)
 
 
 def test_field_names_are_unique_across_the_nested_configs():

@@ -107,7 +107,9 @@ def test_module_that_fails_to_import_says_where(tmp_path, monkeypatch):
 
 @dataclasses.dataclass(frozen=True)
 class Nameless(Corridor):
-    """Its name is a field, as the toy's is."""
+    """Its name is a field."""
+
+    name: str = "Nameless"
 
 
 @dataclasses.dataclass(frozen=True)
