@@ -167,7 +167,7 @@ def gradient_steps(task: Task) -> list[Row]:
         # A small replay of few episodes: its size changes little (part replay_size of the benchmark), and filling it would take long.
         episodes = dict(learning_starts=0, buffer_size=whole_episodes(20_000, config.num_envs))
         config = dataclasses.replace(config, **episodes)
-        num_updates = config.updates_per_iteration if task.quick else SETTINGS[setting].steps_per_call
+        num_updates = config.num_updates if task.quick else SETTINGS[setting].steps_per_call
         config, columns = _small(config) if task.quick else config, num_updates * num_seeds * config.batch.batch_size
         calls = 2 + 2 * task.effort.rounds
         if not task.fits(f"{setting}, {num_seeds} seeds", longest_start + (calls * columns * per_column if rows else 0.0)):

@@ -59,9 +59,9 @@ class Loop:
 
     def learner(self, num_updates: int) -> Callable[[], None]:
         """Compiles `train.learn` for `num_updates` gradient steps, whole iterations of the loop; each call of the result goes on from the last."""
-        num_iterations, rest = divmod(num_updates, self.config.updates_per_iteration)
+        num_iterations, rest = divmod(num_updates, self.config.num_updates)
         if rest:
-            raise ValueError(f"{num_updates} gradient steps are no multiple of the {self.config.updates_per_iteration} of an iteration")
+            raise ValueError(f"{num_updates} gradient steps are no multiple of the {self.config.num_updates} of an iteration")
         learn = jax.jit(self._with_sampler(training.learn, num_iterations=num_iterations), donate_argnums=0).lower(self.state, self.data).compile()
 
         def call() -> None:
@@ -103,7 +103,7 @@ def prioritised_sampler(loop: Loop, num_batches: int) -> Callable[[], None]:
 
     Each call goes on from the priorities that the last one left. Errors are made up; what it takes to compute them is not in here.
     """
-    config, together = loop.config, loop.config.updates_per_iteration
+    config, together = loop.config, loop.config.num_updates
 
     @functools.partial(jax.jit, donate_argnums=0)
     def draw(first: Priorities, key: Array, state: TrainState, data: Guidance) -> tuple[Priorities, Transition]:

@@ -1,6 +1,6 @@
 """A task of your own: from the left room to a target in the right room, through a gate whose height differs from episode to episode.
 
-hindrl train --env two_rooms:TwoRooms --demos 3 --epsilon-steps 3 --demo-reset-ratio 0.5 --steps 40000
+hindrl train --env two_rooms:TwoRooms --demos 3 --steps 40000
 """
 
 import dataclasses

@@ -5,7 +5,7 @@
     env = hindrl.make("FixedGridPickAndPlace")
     demonstrations = hindrl.record_demonstrations(env, num_demos=1)
     result = hindrl.fit(env, demonstrations, hindrl.preset("hindrl"), seeds=[0])
-    print(result.final_success)
+    print(result.returned.success)
 
 The algorithm is in `hindrl_jax.core`: pure functions that know no task by name. Everything in `__all__` is public.
 """

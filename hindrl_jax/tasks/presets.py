@@ -8,8 +8,8 @@ The default is `TrainConfig()`, whatever the task is called. What differs betwee
 
     action_hold            from the median length of the demonstrations (`core.holding.longest_hold`)
     updates_per_iteration  one gradient step for every 4 environment steps
-    input scales, epsilon  from the demonstrations (`core.inputs.input_scale`, thesis eq. 4.7); epsilon is the environment's own tolerance where it
-                           tells one
+    input scales, epsilon  from the demonstrations (`core.inputs.input_scale`, thesis eq. 4.7); epsilon is the tolerance of the environment where
+                           episodes come with its goals and it tells one
     behavioural goals      those that episodes come with; else the task's one goal where hindsight relabels observations; else the ends of
                            demonstrations (thesis algorithm 5)
     relabelling            where episodes have goals of their own, or parameters of the task in their observations, half of the replay rows, with
@@ -100,11 +100,10 @@ def _has_many_tasks(env: Environment) -> bool:
 
 def _goals(env: Environment) -> GoalConfig:
     """Goals and epsilon, by what the environment is."""
-    tolerance = getattr(env, "goal_tolerance", None)
-    epsilon: dict[str, Any] = {} if tolerance is None else dict(epsilon=round(float(tolerance.min()), 4))
     if _gives_goals(env):
-        return GoalConfig(behavioural_goals="environment", **epsilon)
-    return GoalConfig(behavioural_goals="task" if isinstance(env, RelabelsObservations) else "final_demonstration_states", **epsilon)
+        tolerance = getattr(env, "goal_tolerance", None)
+        return GoalConfig(behavioural_goals="environment", epsilon=None if tolerance is None else round(float(tolerance.min()), 4))
+    return GoalConfig(behavioural_goals="task" if isinstance(env, RelabelsObservations) else "final_demonstration_states")
 
 
 _FRAMEWORK: dict[str, Any] = dict(input_encoding="raw", actor_average_rate=1.0, actor_average_span=0.0)

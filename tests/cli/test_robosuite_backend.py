@@ -146,9 +146,11 @@ def run(arm, tmp_path_factory):
         field.name: jnp.ones((2, env.observation_dim if field.name.startswith("observation") else env.goal_dim))
         for field in dataclasses.fields(InputScale)
     }
+    policies = make_agents(jax.random.split(jax.random.key(0), 2), InputScale(**scale))
     result = SimpleNamespace(
+        returned=SimpleNamespace(actor=policies.average_actor),
         guidance=SimpleNamespace(behavioural_goals=goals, epsilon=jnp.ones((2, env.goal_dim))),
-        state=SimpleNamespace(agent=make_agents(jax.random.split(jax.random.key(0), 2), InputScale(**scale))),
+        state=SimpleNamespace(agent=policies),
     )
     path = tmp_path_factory.mktemp("runs") / "untrained"
     runs.RunWriter(path, RunSpec(env=env, config=config, demos="2", seeds=(0, 1)), overwrite=False).start()
@@ -173,7 +175,7 @@ def test_each_seed_plays_its_own_policy_towards_one_of_its_goals_per_episode(run
     env, config = loaded.spec.env, loaded.spec.config
     acted = []
 
-    def stub_player(env, act, num_episodes):
+    def stub_player(env, act, num_episodes, num_held):
         @jax.jit
         def act_twice(key):
             key_reset, *keys_act = jax.random.split(key, 3)

@@ -65,7 +65,7 @@ def test_actions_are_held_as_the_config_says_which_notes_what_was_chosen(tmp_pat
     monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
     hindrl.register(Corridor)
     env, demos, out = Corridor(horizon=150, width=125.0), tmp_path / "demos.hdf5", tmp_path / "sweep"
-    demonstrations = corridor_demonstrations((1.0,), env=env).replace(states=None)
+    demonstrations = corridor_demonstrations((1.0,), env=env)
     hindrl.save_demonstrations(demos, demonstrations, env=env, env_args=dataclasses.asdict(env))
     where = ["--env", "Corridor", "--horizon", "150", "--width", "125", "--demos", str(demos)]
     sizes = shlex.split("--num-envs 2 --learning-starts 300 --steps 330 --eval-every 20 --eval-episodes 3 --updates-per-iteration 1")
@@ -79,7 +79,7 @@ def test_actions_are_held_as_the_config_says_which_notes_what_was_chosen(tmp_pat
         assert (saved["action_hold"], saved["agent"]["learning_rate"]) == (2, float(rate))
         run = load_run(folder)
         assert run.spec.config.action_hold == 2
-        played = run.play(jax.random.key(0), episodes=2)
+        played = run.play(2, key=jax.random.key(0))
         pairs = played.actions.reshape(2, 75, 2, 2)
         within = np.arange(75) < played.lengths[:, None] // 2
         np.testing.assert_array_equal(pairs[within][:, 0], pairs[within][:, 1])
@@ -142,7 +142,7 @@ def test_sweep_leaves_a_run_for_each_setting(tmp_path, capsys):
         (["sweep", "--over", "gamma=0.9,x"], "write for example --over gamma=0.1,0.2"),
         (["sweep", "--over", "gamma=0.9,0.9"], "a value is listed twice"),
         (["sweep", "--over", "gamma=0.9,0.9000000001"], "a value is listed twice"),
-        (["sweep", "--over", "epsilon_deviations=1,2"], "would change nothing: epsilon depends on it only for epsilon_steps > 0"),
+        (["sweep", "--over", "epsilon_deviations=1,2", "--epsilon", "0.1"], "would change nothing: epsilon itself is given"),
         (["sweep", "--over", "union_sampling_ratio=0.1,0.2"], "would change nothing: only relabelling by joint_union"),
         (["sweep", "--algo", "bc", "--over", "gamma=0.1,0.2"], "would change nothing: behaviour cloning does not use it"),
         (["sweep", "--over", "gamma=0.9", "--over", "gamma=0.8"], "gamma is given twice"),

@@ -48,7 +48,7 @@ def test_net_arch_and_layer_norm_are_obeyed(actor, critics):
     assert [layer["kernel"].shape for layer in actor["params"].values()] == [(3, 16), (16, 12), (12, 4)]  # no layer norm in the actor
     assert critics["params"]["Dense_0"]["kernel"].shape == (3, INPUT_DIM + ACTION_DIM, 16)
     assert critics["params"]["LayerNorm_1"]["scale"].shape == (3, 12)
-    plain = jax.eval_shape(lambda key: init_critics(key, AgentConfig(net_arch=(8,)), input_dim=3, action_dim=2), jax.random.key(0))
+    plain = jax.eval_shape(lambda key: init_critics(key, AgentConfig(net_arch=(8,), layer_norm=False), input_dim=3, action_dim=2), jax.random.key(0))
     assert sorted(plain["params"]) == ["Dense_0", "Dense_1"]
 
 

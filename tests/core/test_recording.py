@@ -155,7 +155,7 @@ def test_a_reverse_curriculum_widens_from_the_end_of_the_demonstrations():
 def test_achieved_goals_are_given_to_new_episodes_and_judge_them():
     env = make_env()
     batch = BatchConfig(batch_size=64, relabelled_per_original=0, n_step=1, max_demo_ratio=0.0)
-    config = make_config(goal=GoalConfig(achieved_goal_ratio=1.0), batch=batch)
+    config = make_config(goal=GoalConfig(epsilon_steps=0, achieved_goal_ratio=1.0), batch=batch)
     data = make_data(config, (1.0,))
 
     @jax.jit

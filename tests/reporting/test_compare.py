@@ -111,7 +111,7 @@ def test_the_command_prints_a_table_and_writes_what_it_is_asked_for(first, tmp_p
     printed = " ".join(capsys.readouterr().out.split())
     assert "first 95.0% [90, 100] 2 of 2 250 25.0 lower 75.0% [70, 80] 0 of 2 never never -20.0 [-20, -20]" in printed
     assert "bc 50.0% [50, 50] 2 of 2 300 updates 15.0 -45.0 [-50, -40] alone * 25.0% 0 of 1 never never ~ -70.0 lower:" in printed
-    assert "lower: seeds 1 0 instead of 0 to 1, num_envs 64 instead of 16" in printed
+    assert "lower: seeds 1 0 instead of 0 to 1, num_envs 64 instead of 8" in printed
     assert picture.read_bytes().startswith(b"\x89PNG")
     rows = list(csv.DictReader(table.read_text().splitlines()))
     assert [(row["run"], row["median_env_steps_to_95"], row["median_updates_to_95"], row["difference"], row["paired"]) for row in rows] == [

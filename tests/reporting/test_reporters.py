@@ -15,6 +15,7 @@ from hindrl_jax.base import extras
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.runs import writer as runs
 from hindrl_jax.training.result import Result, Row, SeedSummary
+from hindrl_jax.training.selection import Returned
 
 ENV = hindrl.make("FixedGridPickAndPlace")
 CONFIG = TrainConfig()
@@ -33,10 +34,13 @@ def result(rows, seeds=(3, 4), *, final=None, config=CONFIG):
         seeds=tuple(seeds),
         guidance=None,
         state=None,
+        kept=None,
         rows=rows,
         compile_seconds=1.0,
         final_success=final and np.array(final),
         final_length=final and np.full(len(final), 42.0),
+        evaluation_steps=final and np.full(len(final), 900),
+        returned=final and Returned(actor=None, **{name: np.array(final) for name in ("success", "length", "env_steps", "updates", "seconds")}),
     )
 
 
@@ -235,6 +239,7 @@ def test_the_writer_of_a_run_tells_its_reporters(tmp_path):
     writer.report(ROWS)
     (reporter,) = writer.reporters
     summary = dict(best_success=1.0, env_steps_to_95=None, updates_to_95=None, seconds_to_95=None, episode_length=1.0)
+    summary |= {field.name: 0 for field in dataclasses.fields(SeedSummary) if field.name.startswith(("returned", "evaluation"))}
     reporter.finish([SeedSummary(seed=seed, final_success=0.5, **summary) for seed in (3, 4)])
     assert told == [("start", (3, 4)), (100, [0.25, 0.75]), (200, [0.5, 1.0]), (200, [0.5, 0.5]), "close"]
     assert (tmp_path / "metrics.csv").read_text().count("\n") == 5

@@ -62,7 +62,7 @@ def test_configs_that_differ_in_numbers_share_one_program(demonstrations):
         CONFIG,
         batch=dataclasses.replace(CONFIG.batch, hindrl_sampling_strategy="joint_union", relabelled_per_original=1.0),
         goal=GoalConfig(epsilon_steps=2),
-        agent=dataclasses.replace(CONFIG.agent, final_learning_rate=1e-4, final_bc_weight=0.01),
+        agent=dataclasses.replace(CONFIG.agent, final_learning_rate=1e-4, final_bc_weight=0.01, target_entropy=-1.0, final_target_entropy=-10.0),
     )
     other = with_values(config, OTHER_VALUES)
     assert all(sweepable_value(config, name) != sweepable_value(other, name) for name in SWEEPABLE)
@@ -99,6 +99,7 @@ def test_the_reach_recipe_runs_from_demonstration_to_evaluation(task, tmp_path, 
         num_envs=2,
         updates_per_iteration=2,
         learning_starts=400,
+        demo_reset_ratio=0.5,
         eval_every=16,
         eval_episodes=2,
         batch=dataclasses.replace(recipe.batch, batch_size=32),

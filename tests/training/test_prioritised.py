@@ -307,7 +307,7 @@ def test_prioritised_training_over_two_seeds():
         # Targets lie in [0, 1], as do hardly any errors by then. Demonstrations: at most 3 more; (1 + 3)^0.5 was their first priority.
         assert priorities.demonstrations[demonstrated].min() > (3.0 + 1e-3) ** 0.5 - 1e-6
         assert np.median(priorities.replay[renewed]) < 1.0
-        assert priorities.largest == max(1.0, priorities.replay.max())
+        assert priorities.largest >= max(1.0, priorities.replay.max())  # which may have fallen since
     # 14 demonstrated transitions of priority 2 and some 30 of priority 1 or less.
     assert (metrics["batch/demonstrations"] > 0.2).all()
 
