@@ -80,8 +80,8 @@ def test_actions_are_held_as_the_config_says_which_notes_what_was_chosen(tmp_pat
         run = load_run(folder)
         assert run.spec.config.action_hold == 2
         played = run.play(2, key=jax.random.key(0))
-        pairs = played.actions.reshape(2, 75, 2, 2)
-        within = np.arange(75) < played.lengths[:, None] // 2
+        pairs = np.asarray(played.actions).reshape(2, 75, 2, 2)
+        within = np.arange(75)[None] < np.asarray(played.lengths)[:, None] // 2
         np.testing.assert_array_equal(pairs[within][:, 0], pairs[within][:, 1])
         assert all(row["episode_length"] % 2 == 0 for row in run.evaluate(episodes=1))  # the horizon is even
         rows = list(csv.DictReader((folder / "metrics.csv").read_text().splitlines()))
