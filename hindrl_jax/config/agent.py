@@ -16,7 +16,7 @@ class AgentConfig:
     """The algorithm below the demonstrations: truncated quantile critics, soft actor-critic (Haarnoja et al., 2018), TD3 (Fujimoto et al., 2018;
     its actor delayed) or DDPG (Lillicrap et al., 2016; with one critic). Only tqc has quantiles, only tqc and sac have entropy; td3 and
     ddpg need a preactivation_weight."""
-    net_arch: tuple[int, ...] = (128, 128, 128)
+    net_arch: tuple[int, ...] = (64, 64, 64, 64)
     """Widths of the hidden layers, the same for actor and critics."""
     layer_norm: bool = True
     """Layer normalisation before each activation of the critics."""
