@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.types import Array, Episodes, TimeStep, tree_where
 from hindrl_jax.config import TrainConfig
+from hindrl_jax.core.rollout import Evaluation
 
 FEWEST_DECISIONS = 60
 """Decisions that the median demonstration still takes when its actions are held for as long as can be."""
@@ -76,6 +77,11 @@ def _step(held: HeldActions, state: Any, action: Array) -> tuple[Any, TimeStep]:
 
 def _stepper(held: HeldActions, num_envs: int) -> Any:
     return held.env.stepper(num_envs, num_held=held.num_held)
+
+
+def in_control_steps(evaluation: Evaluation, env: Environment, num_held: int) -> Evaluation:
+    """What became of episodes of `hold(env, num_held)`, with lengths in control steps of `env`; the horizon may cut the last decision short."""
+    return evaluation.replace(length=jnp.minimum(evaluation.length * num_held, env.horizon))
 
 
 def longest_hold(lengths: Array) -> int:

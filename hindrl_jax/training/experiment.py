@@ -16,7 +16,7 @@ from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Episodes
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.core.agent import Policy, policy
-from hindrl_jax.core.holding import hold, hold_demonstrations, with_action_hold
+from hindrl_jax.core.holding import hold, hold_demonstrations, in_control_steps, with_action_hold
 from hindrl_jax.core.rollout import Evaluation
 from hindrl_jax.training.checks import check_config, check_seeds, check_trainable, configs_per_seed, demonstrations_per_seed
 from hindrl_jax.training.devices import gather, spread
@@ -150,8 +150,8 @@ def _train(result: Result, programs: Programs, report: Report) -> None:
 
 def _evaluate(result: Result, programs: Programs, started: float) -> None:
     """Evaluates the present policies, notes it, and keeps those that are good."""
-    agent, stop_at = result.state.agent, result.config.stop_at
-    evaluation = _played(result, programs, policy(agent, average=True), result.config.eval_episodes)
+    present, stop_at = policy(result.state.agent, average=True), result.config.stop_at
+    evaluation = _played(result, programs, present, result.config.eval_episodes)
     result.train_seconds = time.perf_counter() - started
     averaged = {name: np.mean([chunk[name] for chunk in result.chunks], axis=0) for name in result.chunks[0]} if result.chunks else {}
     result.rows += _rows(result, evaluation, averaged)
@@ -160,9 +160,9 @@ def _evaluate(result: Result, programs: Programs, started: float) -> None:
     if stop_at is not None:
         confirmed = (np.asarray(evaluation.success).mean(axis=1) >= stop_at) & (result.kept.confirmed < 0)
         if confirmed.any():
-            again = _played(result, programs, policy(agent, average=True), FRESH_EPISODES)
+            again = _played(result, programs, present, FRESH_EPISODES)
             confirmed &= np.asarray(again.success).mean(axis=1) >= stop_at
-    result.kept = keep(result.kept, gather(agent.average_actor), evaluation, confirmed, result.moment)
+    result.kept = keep(result.kept, gather(present.actor), evaluation, confirmed, result.moment)
 
 
 def _finish(result: Result, programs: Programs) -> None:
@@ -182,9 +182,7 @@ def _finish(result: Result, programs: Programs) -> None:
 def _played(result: Result, programs: Programs, policies: Policy, num_episodes: int) -> Evaluation:
     """What became of fresh episodes, numpy leaves (S, num_episodes), lengths in environment steps; they are counted."""
     result.key, evaluation = programs.evaluate(result.key, policies, result.guidance, num_episodes)
-    evaluation = gather(evaluation)
-    lengths = np.minimum(evaluation.length * result.config.num_held, result.env.horizon)  # the horizon may cut the last decision short
-    evaluation = evaluation.replace(length=lengths)
+    evaluation = jax.device_get(in_control_steps(gather(evaluation), result.env, result.config.num_held))
     before = 0 if result.evaluation_steps is None else result.evaluation_steps
     result.evaluation_steps = before + np.asarray(evaluation.length).sum(axis=1, dtype=np.int64)
     return evaluation

@@ -19,7 +19,7 @@ from hindrl_jax.config import TrainConfig
 from hindrl_jax.core import rollout
 from hindrl_jax.core.agent import Policy
 from hindrl_jax.core.goals import GoalTable, sample_goals
-from hindrl_jax.core.holding import hold
+from hindrl_jax.core.holding import hold, in_control_steps
 from hindrl_jax.core.rollout import Evaluation
 from hindrl_jax.core.train import make_policy
 from hindrl_jax.tasks.registry import Act, task
@@ -123,9 +123,9 @@ class TrainedPolicies:
         """
         env = hold(self.env, self.num_held)
         if can_step(env):
-            return self._in_steps(self._evaluate_in_jax(env, keys, num_episodes))
+            return jax.device_get(in_control_steps(self._evaluate_in_jax(env, keys, num_episodes), self.env, self.num_held))
         if can_step_on_host(env):
-            return self._in_steps(self._evaluate_on_host(env, keys, num_episodes))
+            return jax.device_get(in_control_steps(self._evaluate_on_host(env, keys, num_episodes), self.env, self.num_held))
         return self._evaluate_one_by_one(keys, num_episodes, report)
 
     def play(self, key: Array, index: int, num_episodes: int) -> Episodes:
@@ -172,10 +172,6 @@ class TrainedPolicies:
             pictures += episode
             num_solved += solved
         return pictures, num_solved
-
-    def _in_steps(self, evaluation: Evaluation) -> Evaluation:
-        """Lengths in steps of the environment, from lengths in decisions, the last of which the horizon may cut short."""
-        return evaluation.replace(length=np.minimum(evaluation.length * self.num_held, self.env.horizon))
 
     def _evaluate_in_jax(self, env: Steppable, keys: Array, num_episodes: int) -> Evaluation:
         """All episodes of all policies in one compiled program."""
