@@ -20,7 +20,6 @@ FOLDER = Path(__file__).parent
 
 OURS = {
     "ours": "`train.learn`: the whole loop, environment steps, replay and sampling included",
-    "ours-bfloat16": "`ours` with `network_precision = bfloat16`",
     "ours-update": "`agent.update` alone, on one fixed batch",
     "passes-own": "nothing but the network passes, by the project's networks",
     "passes": "nothing but the network passes, written the usual way and left to XLA",

@@ -9,7 +9,6 @@ and it answers with one line of JSON, {"steps": 20, "cpu_ms": 54.1, "wall_ms": 2
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import sys
 from collections.abc import Callable
@@ -32,12 +31,6 @@ from hindrl_jax.core.train import TrainState
 def whole_loop(setting: Setting) -> Callable[[], None]:
     """`train.learn`: environment steps, insertion into the replay, sampling and relabelling included."""
     return Loop(setting.config).learner(setting.steps_per_call)
-
-
-def whole_loop_bfloat16(setting: Setting) -> Callable[[], None]:
-    """The same with the networks' products in bfloat16."""
-    agent = dataclasses.replace(setting.config.agent, network_precision="bfloat16")
-    return whole_loop(dataclasses.replace(setting, config=dataclasses.replace(setting.config, agent=agent)))
 
 
 def update_alone(setting: Setting) -> Callable[[], None]:
@@ -76,7 +69,6 @@ def network_passes(setting: Setting, *, own: bool) -> Callable[[], None]:
 
 CONTESTANTS: dict[str, Callable[[Setting], Callable[[], None]]] = {
     "ours": whole_loop,
-    "ours-bfloat16": whole_loop_bfloat16,
     "ours-update": update_alone,
     "passes": lambda setting: network_passes(setting, own=False),
     "passes-own": lambda setting: network_passes(setting, own=True),

@@ -30,7 +30,7 @@ _GOALS = jnp.array([*DEMO_STATES, (np.nan,) * 3], jnp.float32)  # the last row i
 TABLE = GoalTable(goals=_GOALS, observations=_GOALS, count=jnp.asarray(len(DEMO_STATES)))
 
 LENGTHS = st.lists(st.lists(st.integers(1, HORIZON), min_size=1, max_size=5), min_size=NUM_ENVS, max_size=NUM_ENVS)
-BATCH = BatchConfig(batch_size=64, max_demo_ratio=0.2, relabelled_per_original=3, gamma=0.5, n_step=2, bound_by_obtained_return=True)
+BATCH = BatchConfig(batch_size=64, max_demo_ratio=0.2, relabelled_per_original=3, gamma=0.5, n_step=2)
 NUM_DEMO, NUM_RELABELLED = 12, 39  # int(0.2 * 64), (64 - 12) * 3 // 4
 STRATEGIES = {
     "final": {},
@@ -41,7 +41,6 @@ STRATEGIES = {
     "joint_union": {},
     "joint_intersection": {},
     "the other joint_intersection": {"intersection_goals": "demonstrations"},
-    "mixture": {"strategy_mixture": (("final", 1.0), ("random", 2.0), ("joint_intersection", 3.0))},
 }
 
 
@@ -217,7 +216,7 @@ def allowed_goals(strategy, state, length, sources):
         "joint_intersection": close,
         "the other joint_intersection": [DEMO_STATES[near(*other)] for other in close],
     }
-    return set(goals["final"] + goals["random"] + goals["joint_intersection"] if strategy == "mixture" else goals[strategy])
+    return set(goals[strategy])
 
 
 def check_rows(batch, in_hindsight, sources, strategy, config: TrainConfig):
@@ -231,11 +230,10 @@ def check_rows(batch, in_hindsight, sources, strategy, config: TrainConfig):
         assert (env == DEMO) == is_demonstration
         assert t < length
         allowed = allowed_goals(strategy, state, length, sources) if in_hindsight[row] else set()
-        relabelled = bool(allowed) if strategy != "mixture" else goal in allowed
+        relabelled = bool(allowed)
         assert batch.is_relabelled[row] == relabelled
         assert goal in (allowed if relabelled else {(-1 - env, episode, 0)})
         reward, discount, following = expected_return(state, length, goal, by_goal=relabelled, config=config)
         assert (batch.reward[row], batch.discount[row]) == (reward, discount)  # exact, since gamma = 1/2
-        assert batch.obtained_return[row] == (0.0 if relabelled else reward_of(env, episode, length - 1) * 0.5 ** (length - 1 - t))
         assert nexts[row] == following
         assert batch.action[row, 0] == reward_of(env, episode, t)

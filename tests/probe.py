@@ -25,11 +25,10 @@ CONFIG = TrainConfig(
         num_quantiles=4,
         top_quantiles_to_drop_per_net=0,
         target_update_rate=0.1,
-        actor_average_rate=0.2,
+        actor_average_span=0.25,
         initial_alpha=1e-4,
         target_entropy=-50.0,
         final_target_entropy=None,
-        final_learning_rate=None,
         bc_weight=0.0,
         input_encoding="raw",
     ),
@@ -52,8 +51,8 @@ def with_quirks(config=CONFIG, **changes):
 
 
 def schedule_of(config):
-    """What holds at the start of a run."""
-    return schedule(0.0, 0, config.agent, action_dim=1)
+    """What holds at the start of a run, but for the actor's average: after 16 gradient steps its rate is 1 / (1 + 16 / 4) = 0.2."""
+    return schedule(0.0, 16, config.agent, action_dim=1)
 
 
 SCHEDULE = schedule_of(CONFIG)

@@ -27,8 +27,8 @@ class Eval:
     """Episodes per seed."""
     seed: int = 0
     """Which episodes: equal numbers give equal ones, in the same back end."""
-    stochastic: bool = False
-    """Sample the actions instead of taking the mean ones."""
+    noise: float | None = None
+    """Of the actions: 0 for the mean ones, 1 for sampled ones (default: what the run has found to be best)."""
     last: bool = False
     """The policies at the end of the run, instead of the best that it has seen."""
     backend: str | None = None
@@ -49,7 +49,7 @@ def evaluate(arguments: list[str]) -> None:
         outcomes = run.evaluate(
             episodes=options.episodes,
             key=episode_key(options.seed),
-            stochastic=options.stochastic,
+            noise=options.noise,
             report=lambda played: progress.update(bar, completed=played),
         )
     table = Table("seed", "success", "length", box=box.SIMPLE_HEAD)
@@ -74,8 +74,8 @@ class Render:
     """Which episode: equal numbers give equal ones."""
     episodes: int = 1
     """How many, one after the other, from that one on."""
-    stochastic: bool = False
-    """Sample the actions instead of taking the mean ones."""
+    noise: float | None = None
+    """Of the actions: 0 for the mean ones, 1 for sampled ones (default: what the run has found to be best)."""
     last: bool = False
     """The policy at the end of the run, instead of the best that it has seen."""
 
@@ -88,6 +88,6 @@ def render(arguments: list[str]) -> None:
     run = load_run(options.directory, last=options.last)
     path = options.to or options.directory / f"episode_{options.episode}_seed_{run.spec.seeds[0] if options.seed is None else options.seed}.gif"
     keys = jnp.stack([episode_key(options.episode + number) for number in range(options.episodes)])
-    solved = run.render(path, seed=options.seed, key=keys, stochastic=options.stochastic)
+    solved = run.render(path, seed=options.seed, key=keys, noise=options.noise)
     single = f"the episode is {'solved' if solved else 'not solved'}"
     console.print(f"wrote {path}: {single if options.episodes == 1 else f'{solved} of {options.episodes} episodes are solved'}")

@@ -71,7 +71,7 @@ def ablate(arguments: list[str]) -> None:
     with _bars() as progress:
         for trained, cell in enumerate(to_train, 1):
             name = f"{cell.task} {cell.name}: "
-            bar = progress.add_task(f"{name}compiling", total=cell.spec.config.steps, rates="")
+            bar = progress.add_task(f"{name}compiling", total=cell.spec.config.num_steps, rates="")
             cells.train(cell, report=functools.partial(_advance, progress, bar, name))
             progress.remove_task(bar)
             outcomes = outcomes_of(everything)
@@ -97,7 +97,7 @@ def _advance(progress: Progress, bar: TaskID, name: str, result: Result) -> None
     rates = f"{runs * result.env_steps / seconds:,.0f} steps/s, {runs * result.updates / seconds:,.0f} updates/s"
     progress.update(
         bar,
-        completed=min(result.steps_done, result.config.steps),
+        completed=min(result.steps_done, result.config.num_steps),
         description=name + ("training" if success is None else f"success {success:4.0%}"),
         rates=rates if result.train_seconds else "",
     )

@@ -105,7 +105,7 @@ def run(spec: RunSpec, configs: Sequence[TrainConfig], writer: RunWriter | Sweep
                 steps = int(np.median([table.lengths for table in demonstrations]))
                 progress.say(f"each action is held for {num_held} steps, so a demonstration of {steps} steps takes {-(-steps // num_held)} decisions")
             for share in spec.config.agent_resets:
-                progress.say(f"the agent begins anew at step {share * spec.config.steps:,.0f}, so success will drop there and come back")
+                progress.say(f"the agent begins anew at step {share * spec.config.num_steps:,.0f}, so success will drop there and come back")
             if resumes:
                 progress.say(f"going on at step {result.steps_done:,}" if result.steps_done else "there is no checkpoint yet: beginning again")
             stop_signals.note()
@@ -152,7 +152,7 @@ def _stop(result: Result, number: int, writer: RunWriter | SweepWriter, checkpoi
     else:
         checkpoints.save(result)
         said = f"go on with `hindrl {'sweep' if isinstance(writer, SweepWriter) else 'train'} --resume {writer.path}`"
-    print(f"hindrl: stopped after {result.steps_done:,} of {result.config.steps:,} steps; {said}", file=sys.stderr)
+    print(f"hindrl: stopped after {result.steps_done:,} of {result.config.num_steps:,} steps; {said}", file=sys.stderr)
     sys.exit(128 + number)
 
 

@@ -38,15 +38,17 @@ def train(arguments: list[str]) -> None:
 
 
 def _summary_table(summary: dict[str, Any], config: TrainConfig) -> Table:
-    """A line for each seed: the policy that was kept, the last one, and when 95% was reached first."""
+    """A line for each seed: the policy that was kept and whether it plays mean or sampled actions, the last one, and when 95% was reached first."""
     cloning = not config.learns_from_rollouts  # and so takes no environment steps
-    unit, updates = ("updates", []) if cloning else ("env_steps", ["updates"])
-    table = Table("seed", "kept", "length", "of update" if cloning else "of step", "last", "95% after", *updates, "seconds", box=box.SIMPLE_HEAD)
+    unit, updates, actions = ("updates", [], []) if cloning else ("env_steps", ["updates"], ["actions"])
+    moment = "of update" if cloning else "of step"
+    table = Table("seed", "kept", "length", *actions, moment, "last", "95% after", *updates, "seconds", box=box.SIMPLE_HEAD)
     for column in table.columns:
         column.justify = "right"
     for seed in summary["seeds"]:
-        cells = [str(seed["seed"]), f"{seed['returned_success']:.0%}", f"{seed['returned_length']:.1f}", f"{seed[f'returned_{unit}']:,}"]
-        cells.append(f"{seed['final_success']:.0%}")
+        cells = [str(seed["seed"]), f"{seed['returned_success']:.0%}", f"{seed['returned_length']:.1f}"]
+        cells += ["sampled" if seed["returned_noise"] else "mean"] * len(actions)
+        cells += [f"{seed[f'returned_{unit}']:,}", f"{seed['final_success']:.0%}"]
         if seed["updates_to_95"] is None:
             cells.append("never")
         else:

@@ -12,20 +12,14 @@ from hindrl_jax.base.checks import check, check_types
 class AgentConfig:
     """Truncated quantile critics, the actor, and how both are trained."""
 
-    base: Literal["tqc", "sac", "td3", "ddpg"] = "tqc"
-    """The algorithm below the demonstrations: truncated quantile critics, soft actor-critic (Haarnoja et al., 2018), TD3 (Fujimoto et al., 2018;
-    its actor delayed) or DDPG (Lillicrap et al., 2016; with one critic). Only tqc has quantiles, only tqc and sac have entropy; td3 and
-    ddpg need a preactivation_weight."""
+    base: Literal["tqc", "sac"] = "tqc"
+    """The algorithm below the demonstrations: truncated quantile critics, or soft actor-critic (Haarnoja et al., 2018), which has no quantiles."""
     net_arch: tuple[int, ...] = (64, 64, 64, 64)
     """Widths of the hidden layers, the same for actor and critics."""
     layer_norm: bool = True
     """Layer normalisation before each activation of the critics."""
-    network_precision: Literal["float32", "bfloat16"] = "float32"
-    """Operands of the networks' products: float32 (on NVIDIA GPUs TF32, as JAX has it), or bfloat16 summed in float32: faster, less steady."""
     learning_rate: float = 1e-3
     """Adam's step size, for actor, critics and entropy coefficient."""
-    final_learning_rate: float | None = None
-    """Where the step size has moved, linearly, by the end of the run; None keeps it constant."""
     clip_targets: bool = True
     """Clip the critics' targets to [0, 1], which holds every return where the one reward of an episode is 1 and ends it (Andrychowicz et al.,
     hindsight experience replay, 2017)."""
@@ -39,33 +33,17 @@ class AgentConfig:
     """Largest target quantiles dropped per critic (TQC's truncation)."""
     target_update_rate: float = 0.02
     """Share of the online critics that moves into the target critics at each gradient step (Polyak averaging)."""
-    actor_average_rate: float = 0.002
-    """Share of the actor that moves into its running average at each gradient step; evaluations and the saved policy use the average."""
     actor_average_span: float = 0.25
-    """Share of the gradient steps so far that the average spans at least: it moves by at most 1 / (1 + span * steps), less and less."""
+    """Share of the gradient steps so far that the actor's running average spans, which evaluations and the saved policy use: it moves by
+    1 / (1 + span * steps), less and less. With 0 it is the actor itself."""
     initial_alpha: float = 0.002
     """Entropy coefficient at the start; it is tuned automatically from there."""
-    target_entropy: float | None = None
-    """Entropy that the automatic tuning aims at, in nats; None means minus the number of action dimensions."""
-    final_target_entropy: float | None = None
+    target_entropy: float = -1.0
+    """Entropy that the automatic tuning aims at, in nats per action dimension; SAC's rule is -1."""
+    final_target_entropy: float | None = -2.0
     """Where the target entropy has moved, linearly, by the end of the run; None keeps it constant."""
-    exploration_noise: float = 0.1
-    """For td3 and ddpg: standard deviation of the noise on the actions of rollouts, which lie in [-1, 1]."""
-    target_noise: float = 0.2
-    """For td3: standard deviation of the noise on the actions of the targets."""
-    target_noise_clip: float = 0.5
-    """For td3: the largest noise on the actions of the targets."""
-    relative_value: bool = False
-    """Divide the value in the actor's loss, row by row, by itself, or by 0.01 where it is less (negative, too): as if the actor climbed the value's
-    logarithm. One step lost then weighs alike near the reward and far from it. The entropy's weight is then in other units than the rewards, so that
-    the critics' targets leave entropy out."""
-    preactivation_weight: float = 0.0
-    """Weight, in the actor's loss, of the squared length of the mode before tanh (HER, appendix A). Without entropy nothing else keeps td3 and ddpg
-    away from saturated actions, which have no gradient."""
     bc_weight: float = 0.05
     """Weight of the behaviour cloning loss on demonstration rows (lambda_BC of the thesis)."""
-    final_bc_weight: float | None = None
-    """Where that weight has moved, linearly, by the end of the run; None keeps it constant."""
     q_filter: bool = False
     """Clone only the demonstrated actions that the critics value above the policy's own (Nair et al., 2018, eq. 4)."""
     input_encoding: Literal["raw", "multiscale", "standardised"] = "multiscale"
@@ -78,7 +56,6 @@ class AgentConfig:
             self,
             net_arch=(len(self.net_arch) >= 1 and all(width >= 1 for width in self.net_arch), "one or more widths, each at least 1"),
             learning_rate=(self.learning_rate > 0.0, "greater than 0"),
-            final_learning_rate=(self.final_learning_rate is None or self.final_learning_rate >= 0.0, "0 or more, or None"),
             num_critics=(self.num_critics >= 1, "at least 1"),
             num_target_critics=(
                 self.num_target_critics is None or 1 <= self.num_target_critics <= self.num_critics,
@@ -90,23 +67,10 @@ class AgentConfig:
                 f"between 0 and num_quantiles - 1 = {self.num_quantiles - 1}",
             ),
             target_update_rate=(0.0 < self.target_update_rate <= 1.0, "in (0, 1]"),
-            actor_average_rate=(0.0 < self.actor_average_rate <= 1.0, "in (0, 1]; 1 means no averaging"),
             actor_average_span=(self.actor_average_span >= 0.0, "0 or more"),
             initial_alpha=(self.initial_alpha > 0.0, "greater than 0"),
-            exploration_noise=(self.exploration_noise >= 0.0, "0 or more"),
-            target_noise=(self.target_noise >= 0.0, "0 or more"),
-            target_noise_clip=(self.target_noise_clip >= 0.0, "0 or more"),
-            preactivation_weight=(self.preactivation_weight >= 0.0, "0 or more"),
             bc_weight=(self.bc_weight >= 0.0, "0 or more"),
-            final_bc_weight=(self.final_bc_weight is None or self.final_bc_weight >= 0.0, "0 or more, or None"),
         )
-        if self.base == "ddpg" and self.num_critics > 1:
-            raise ValueError(f"ddpg has one critic, but num_critics = {self.num_critics}: set it to 1, or choose td3")
-
-    @property
-    def has_entropy(self) -> bool:
-        """Whether the policy is random and rewarded for it; td3 and ddpg have a deterministic one."""
-        return self.base in ("tqc", "sac")
 
     @property
     def critic_outputs(self) -> int:

@@ -9,8 +9,8 @@ from hindrl_jax.base.checks import check, check_types
 
 Source = Literal["final", "future", "episode", "random", "task_conditioned", "joint_intersection"]
 """Where a relabelled goal may come from, explained in `hindrl_jax.core.hindsight`."""
-Strategy = Literal["final", "future", "rollout_conditioned", "episode", "random", "task_conditioned", "joint_union", "joint_intersection", "mixture"]
-"""Hindsight strategies: one of the sources, or a mixture of them."""
+Strategy = Literal["final", "future", "rollout_conditioned", "episode", "random", "task_conditioned", "joint_union", "joint_intersection"]
+"""Hindsight strategies: one of the sources, or task_conditioned and future side by side (joint_union)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,15 +31,10 @@ class BatchConfig:
     """For joint_union: the share of relabelled goals that comes from the demonstrations."""
     intersection_goals: Literal["rollout", "demonstrations"] = "rollout"
     """For joint_intersection: goals that the rollout reached within epsilon of a demonstrated one, or the demonstrated ones that it came near."""
-    strategy_mixture: tuple[tuple[Source, float], ...] = ()
-    """For mixture: the sources of goals and their weights, as in future 0.5 random 0.2 task_conditioned 0.3."""
     n_step: int = 5
     """Steps of reward before the value estimate takes over."""
     gamma: float = 0.98
     """Discount factor."""
-    bound_by_obtained_return: bool = False
-    """No target lies below the return that the row's own episode went on to obtain, which is a lower bound of the optimal value where neither
-    actions nor rewards are random (He et al., optimality tightening, 2017; Oh et al., self-imitation learning, 2018)."""
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -52,18 +47,9 @@ class BatchConfig:
             reach_zero=(self.reach_zero is None or self.reach_zero >= 1, "at least 1 environment step, or None"),
             relabelled_per_original=(self.relabelled_per_original >= 0, "0 (no relabelling) or more"),
             union_sampling_ratio=(0.0 <= self.union_sampling_ratio <= 1.0, "between 0 and 1"),
-            strategy_mixture=(
-                all(weight > 0.0 for _, weight in self.strategy_mixture) and len(dict(self.strategy_mixture)) == len(self.strategy_mixture),
-                "sources that differ, with weights greater than 0",
-            ),
             n_step=(self.n_step >= 1, "at least 1"),
             gamma=(0.0 < self.gamma <= 1.0, "in (0, 1]"),
         )
-        if (self.hindrl_sampling_strategy == "mixture") != bool(self.strategy_mixture):
-            raise ValueError(
-                f"strategy_mixture = {self.strategy_mixture!r} and hindrl_sampling_strategy = {self.hindrl_sampling_strategy!r} do not belong "
-                "together: give both mixture and its parts, or neither"
-            )
         if self.batch_size - self.max_demo_rows < 1:
             raise ValueError(
                 f"max_demo_ratio = {self.max_demo_ratio} of batch_size = {self.batch_size} leaves no replay row: "
@@ -82,9 +68,9 @@ class BatchConfig:
 
     @property
     def sources(self) -> tuple[tuple[Any, Any], ...]:
-        """The sources of relabelled goals and their weights, which need not sum to 1; none if nothing is relabelled."""
+        """The sources of relabelled goals and their shares; none if nothing is relabelled."""
         if self.relabelled_per_original == 0:
             return ()
         if self.hindrl_sampling_strategy == "joint_union":
             return ("task_conditioned", self.union_sampling_ratio), ("future", 1.0 - self.union_sampling_ratio)
-        return self.strategy_mixture or ((self.hindrl_sampling_strategy, 1.0),)
+        return ((self.hindrl_sampling_strategy, 1.0),)

@@ -25,30 +25,22 @@ def _has_demo_rows(config: TrainConfig) -> bool:
 
 def _clones(config: TrainConfig) -> bool:
     """Whether cloning is ever part of the loss; a `bc_warm_start` clones by itself."""
-    return not config.learns_from_rollouts or config.agent.bc_weight > 0.0 or bool(config.agent.final_bc_weight)
+    return not config.learns_from_rollouts or config.agent.bc_weight > 0.0
 
 
 CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
     (
-        "max_demo_ratio reach_zero relabelled_per_original hindrl_sampling_strategy union_sampling_ratio intersection_goals strategy_mixture "
-        "n_step gamma bootstrap_past_relabelled_goals bound_by_obtained_return timeouts_are_terminal importance_exponent demo_priority_bonus "
-        "achieved_goal_ratio final_achieved_goal_ratio clip_targets num_critics num_target_critics num_quantiles top_quantiles_to_drop_per_net "
-        "layer_norm target_update_rate initial_alpha target_entropy final_target_entropy exploration_noise target_noise "
-        "target_noise_clip relative_value preactivation_weight bc_weight final_bc_weight agent_resets num_envs "
-        "updates_per_iteration learning_starts buffer_size demo_reset_ratio demo_reset_curriculum random_truncation",
+        "max_demo_ratio reach_zero relabelled_per_original hindrl_sampling_strategy union_sampling_ratio intersection_goals "
+        "n_step gamma bootstrap_past_relabelled_goals timeouts_are_terminal importance_exponent demo_priority_bonus "
+        "achieved_goal_ratio clip_targets num_critics num_target_critics num_quantiles top_quantiles_to_drop_per_net "
+        "layer_norm target_update_rate initial_alpha target_entropy final_target_entropy bc_weight agent_resets num_envs "
+        "updates_per_iteration learning_starts buffer_size demo_reset_ratio demo_reset_curriculum",
         lambda c: c.learns_from_rollouts,
         "behaviour cloning does not use it: choose another algo",
     ),
-    (
-        "initial_alpha target_entropy final_target_entropy",
-        lambda c: c.agent.has_entropy,
-        "{base} has no entropy coefficient: choose --base tqc or sac",
-    ),
     ("num_quantiles top_quantiles_to_drop_per_net", lambda c: c.agent.base == "tqc", "{base} has no quantiles: choose --base tqc"),
-    ("exploration_noise", lambda c: not c.agent.has_entropy, "{base} samples its actions: choose --base td3 or ddpg"),
-    ("target_noise target_noise_clip", lambda c: c.agent.base == "td3", "{base} has no such noise: choose --base td3"),
     (
-        "hindrl_sampling_strategy union_sampling_ratio intersection_goals strategy_mixture",
+        "hindrl_sampling_strategy union_sampling_ratio intersection_goals",
         _relabels,
         "nothing is relabelled: choose --algo hindrl with --relabelled-per-original above 0",
     ),
@@ -75,11 +67,7 @@ CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
     ("importance_exponent demo_priority_bonus", lambda c: c.priority.is_used, "transitions have no priorities: raise --priority-exponent"),
     ("max_demo_ratio", lambda c: not c.priority.is_used, "the share of demonstrations follows from their priorities: set --priority-exponent 0"),
     ("reach_zero", lambda c: c.batch.max_demo_rows > 0, "the batch has no demonstration rows: raise --max-demo-ratio"),
-    (
-        "bc_weight final_bc_weight q_filter",
-        _has_demo_rows,
-        "the batch has no demonstration rows to clone: raise --max-demo-ratio",
-    ),
+    ("bc_weight q_filter", _has_demo_rows, "the batch has no demonstration rows to clone: raise --max-demo-ratio"),
     (
         "bc_loss bc_action unscaled_demo_actions",
         lambda c: _has_demo_rows(c) or c.bc_warm_start > 0,

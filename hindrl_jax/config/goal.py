@@ -26,8 +26,6 @@ class GoalConfig:
     achieved_goal_ratio: float = 0.0
     """Share of training episodes with another behavioural goal: a state reached earlier in training, whatever the task (thesis chapter 6). They
     are rewarded, when drawn, for reaching that goal. Evaluations never have one."""
-    final_achieved_goal_ratio: float | None = None
-    """Where that share has moved, linearly, by the end of the run; None keeps it constant."""
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -37,10 +35,6 @@ class GoalConfig:
             epsilon_deviations=(self.epsilon_deviations >= 0.0, "0 or more"),
             epsilon=(self.epsilon is None or self.epsilon >= 0.0, "0 or more, or None"),
             achieved_goal_ratio=(0.0 <= self.achieved_goal_ratio <= 1.0, "between 0 and 1"),
-            final_achieved_goal_ratio=(
-                self.final_achieved_goal_ratio is None or 0.0 <= self.final_achieved_goal_ratio <= 1.0,
-                "between 0 and 1, or None",
-            ),
         )
         if self.epsilon is not None and self.epsilon_steps > 1:
             raise ValueError(
@@ -50,4 +44,4 @@ class GoalConfig:
     @property
     def has_achieved_goals(self) -> bool:
         """Whether some training episodes have a behavioural goal that was achieved earlier."""
-        return self.achieved_goal_ratio > 0.0 or bool(self.final_achieved_goal_ratio)
+        return self.achieved_goal_ratio > 0.0

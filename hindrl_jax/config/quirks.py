@@ -18,7 +18,7 @@ class QuirksConfig:
     """Reaching a relabelled goal does not end the return, as in the thesis, so that values can exceed 1. Where hindsight relabels observations in
     place of goals (ParameterizedReach), a solved task always ends it."""
     timeouts_are_terminal: bool = False
-    """Treat episodes that are cut, by the horizon or by random_truncation, as terminated, as the original code does by mistake."""
+    """Treat episodes that are cut by the horizon as terminated, as the original code does by mistake."""
     exclude_last_goal: bool = False
     """Never draw the last goal of a demonstration, as the original code does by mistake."""
     unscaled_demo_actions: bool = False

@@ -14,15 +14,12 @@ SWEEPABLE: dict[str, Literal["batch", "goal", "agent"]] = {
     "gamma": "batch",
     "epsilon_deviations": "goal",
     "learning_rate": "agent",
-    "final_learning_rate": "agent",
     "target_update_rate": "agent",
-    "actor_average_rate": "agent",
     "actor_average_span": "agent",
     "initial_alpha": "agent",
     "target_entropy": "agent",
     "final_target_entropy": "agent",
     "bc_weight": "agent",
-    "final_bc_weight": "agent",
 }
 """The fields that only enter arithmetic, and their sections: configs that differ in nothing else share one compiled program."""
 

@@ -14,6 +14,8 @@ from hindrl_jax.config.quirks import QuirksConfig
 
 STEPS_PER_UPDATE = 4
 """Control steps for each gradient step, where the config does not say how many of these there are."""
+FEWEST_STEPS, DECISIONS = 100_000, 50_000
+"""Environment steps of a run, where the config does not say how many: at least so many, and enough for so many decisions."""
 Algorithm = Literal["bc", "tqcfd", "hindrl", "smooth-hindrl"]
 
 
@@ -23,8 +25,9 @@ class TrainConfig:
 
     algo: Algorithm = "hindrl"
     """Which of the four models: bc, tqcfd (no relabelling), hindrl, smooth-hindrl."""
-    steps: int = 100_000
-    """Environment steps of the run per seed, rounded up to a tenth of eval_every; for bc, which takes none, gradient steps."""
+    steps: int | None = None
+    """Environment steps of the run per seed, rounded up to a tenth of eval_every; for bc, which takes none, gradient steps. None takes 50,000
+    decisions, and at least 100,000 steps."""
     num_envs: int = 8
     """Environments stepped side by side."""
     action_hold: int | None = None
@@ -40,11 +43,6 @@ class TrainConfig:
     demo_reset_curriculum: float = 0.0
     """Share of the run over which those states widen from the end of each demonstration to all of it: a reverse curriculum (RFCL, Tao et al.,
     2024, widens by success instead). 0 draws from all of them throughout."""
-    random_truncation: float = 0.0
-    """Probability with which a training episode is cut off after a step, as a time-out cuts it: the future value still counts (unless
-    timeouts_are_terminal). Episodes that stand still are left sooner, and more are begun. Evaluations are never cut. Each episode keeps room for a
-    whole horizon in the replay, which so holds fewer transitions than buffer_size; and since an episode is drawn before one of its transitions,
-    those of short episodes are drawn more often."""
     bc_warm_start: int = 0
     """Gradient steps of behaviour cloning alone before the first of reinforcement learning, after the random actions of learning_starts."""
     agent_resets: tuple[float, ...] = ()
@@ -67,17 +65,17 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         check_types(self)
-        counts = ("steps", "num_envs", "buffer_size", "eval_every", "eval_episodes")
+        counts = ("num_envs", "buffer_size", "eval_every", "eval_episodes")
         check(
             self,
             **{name: (getattr(self, name) >= 1, "at least 1") for name in counts},
+            steps=(self.steps is None or self.steps >= 1, "at least 1, or None"),
             updates_per_iteration=(self.updates_per_iteration is None or self.updates_per_iteration >= 1, "at least 1, or None"),
             action_hold=(self.action_hold is None or self.action_hold >= 1, "at least 1, or None"),
             stop_at=(self.stop_at is None or 0.0 < self.stop_at <= 1.0, "greater than 0 and at most 1, or None"),
             learning_starts=(self.learning_starts >= 0, "0 or more"),
             demo_reset_ratio=(0.0 <= self.demo_reset_ratio <= 1.0, "between 0 and 1"),
             demo_reset_curriculum=(0.0 <= self.demo_reset_curriculum <= 1.0, "between 0 and 1"),
-            random_truncation=(0.0 <= self.random_truncation < 1.0, "0 or more, and less than 1"),
             bc_warm_start=(self.bc_warm_start >= 0, "0 or more"),
             agent_resets=(
                 all(0.0 < share < 1.0 for share in self.agent_resets) and sorted(set(self.agent_resets)) == list(self.agent_resets),
@@ -108,6 +106,11 @@ class TrainConfig:
     def num_held(self) -> int:
         """Control steps for which each action is held; 1 where nobody has chosen."""
         return self.action_hold or 1
+
+    @property
+    def num_steps(self) -> int:
+        """Environment steps of the run per seed; for bc, gradient steps."""
+        return self.steps or max(FEWEST_STEPS, DECISIONS * self.num_held)
 
     @property
     def steps_per_iteration(self) -> int:

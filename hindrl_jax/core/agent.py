@@ -1,11 +1,9 @@
-"""The agent: truncated quantile critics (or those of SAC, TD3 or DDPG), an actor with a behaviour cloning loss, an automatic entropy coefficient.
+"""The agent: truncated quantile critics (or those of SAC), an actor with a behaviour cloning loss, an automatic entropy coefficient.
 
 One `update` serves TQCfD, HinDRL and Smooth HinDRL, which differ only in the batch they are given; `update_bc` is the BC baseline, on the
 same actor. Differences from the TQC paper (Kuznetsov et al., 2020): the loss is averaged, not summed, over quantiles (as in sb3-contrib,
 which the thesis used), and the discount comes with each transition, so that n-step returns and termination need no special case. By default
-also: inputs encoded at two scales, a target entropy that falls along the run, and a running average of the actor for evaluation. With td3, the
-target critics move at every gradient step, also where the actor waits (in the paper both wait); waiting saves no time, since the actor's
-gradient is computed at every step.
+also: inputs encoded at two scales, targets clipped to what returns can be, and a running average of the actor for evaluation.
 """
 
 from __future__ import annotations
@@ -18,7 +16,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from hindrl_jax.base.types import Array, Transition, tree_where
+from hindrl_jax.base.types import Array, Transition
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.core.inputs import InputScale, network_inputs
 from hindrl_jax.core.kernels import mean_over_blocks, num_blocks
@@ -29,8 +27,6 @@ from hindrl_jax.core.schedules import Schedule
 Metrics = dict[str, Array]
 
 _ADAM = optax.scale_by_adam()  # the step size is applied apart, since it may change along a run
-_LEAST_VALUE = 0.01  # below it, a value is mostly the critics' error
-_TD3_ACTOR_DELAY = 2  # gradient steps of TD3's critics for each one of its actor (Fujimoto et al., 2018)
 
 
 class AgentState(struct.PyTreeNode, kw_only=True):
@@ -38,7 +34,6 @@ class AgentState(struct.PyTreeNode, kw_only=True):
 
     actor: Params
     average_actor: Params  # running average of the actor, which acts more steadily
-    target_actor: Params | None  # follows the actor as the target critics follow the critics; None for algorithms without one
     critics: Params  # leaves (C, ...)
     target_critics: Params  # leaves (C, ...)
     log_alpha: Array  # ()
@@ -53,6 +48,7 @@ class Policy(struct.PyTreeNode, kw_only=True):
 
     actor: Params
     scale: InputScale
+    noise: Array  # () of its actions, before tanh, over the standard deviation that the actor gives them: 0 for the mean action, 1 for sampled ones
 
 
 def init(key: Array, scale: InputScale, config: TrainConfig, *, action_dim: int) -> AgentState:
@@ -65,7 +61,6 @@ def init(key: Array, scale: InputScale, config: TrainConfig, *, action_dim: int)
     return AgentState(
         actor=actor,
         average_actor=jax.tree.map(jnp.copy, actor),
-        target_actor=None if config.agent.has_entropy else jax.tree.map(jnp.copy, actor),
         critics=critics,
         target_critics=jax.tree.map(jnp.copy, critics),
         log_alpha=log_alpha,
@@ -77,22 +72,15 @@ def init(key: Array, scale: InputScale, config: TrainConfig, *, action_dim: int)
 
 
 def policy(state: AgentState, *, average: bool) -> Policy:
-    """The policy that explores, or with `average` the steadier one that is evaluated and saved."""
-    return Policy(actor=state.average_actor if average else state.actor, scale=state.scale)
+    """The policy that explores, or with `average` the mean actions of the steadier one that is evaluated and saved. Leaves (..., ) as the state's."""
+    noise = jnp.zeros_like(state.log_alpha) if average else jnp.ones_like(state.log_alpha)
+    return Policy(actor=state.average_actor if average else state.actor, scale=state.scale, noise=noise)
 
 
-def select_action(key: Array, actor: Params, inputs: Array, config: TrainConfig, *, action_dim: int, stochastic: bool) -> Array:
-    """Actions (B, A) in [-1, 1] at inputs (B, input_dim), see `inputs.network_inputs`: sampled from the policy, or its mode.
-
-    The samples of a deterministic policy (td3, ddpg) are its mode with noise.
-    """
-    distribution = apply_actor(actor, inputs.T, config.agent, action_dim=action_dim)
-    if not stochastic:
-        return distribution.mode.T
-    if config.agent.has_entropy:
-        return distribution.sample(key)[0].T
-    noise = config.agent.exploration_noise * jax.random.normal(key, (inputs.shape[0], action_dim))
-    return jnp.clip(distribution.mode.T + noise, -1.0, 1.0)
+def select_action(key: Array, policy: Policy, inputs: Array, config: TrainConfig, *, action_dim: int) -> Array:
+    """Actions (B, A) in [-1, 1] at inputs (B, input_dim), see `inputs.network_inputs`, with the policy's noise."""
+    distribution = apply_actor(policy.actor, inputs.T, config.agent, action_dim=action_dim)
+    return distribution.at(policy.noise * jax.random.normal(key, distribution.mean.shape))[0].T
 
 
 class _Columns(struct.PyTreeNode, kw_only=True):
@@ -104,7 +92,6 @@ class _Columns(struct.PyTreeNode, kw_only=True):
     reward: Array  # (B,)
     discount: Array  # (B,)
     is_demonstration: Array  # (B,) bool
-    obtained_return: Array | None  # (B,)
     weight: Array | None  # (B,)
     noise: Array  # (A, B) standard normal, for the sampled action
     next_noise: Array  # (A, B) the same for the next action
@@ -115,10 +102,8 @@ def update(key: Array, state: AgentState, batch: Transition, schedule: Schedule,
 
     Critic: quantile Huber loss towards the truncated atoms of r + discount (Z' - alpha log pi(a' | s')); for algorithms without quantiles the
       squared error to r + discount (min Q' - alpha log pi(a' | s')).
-    Actor: mean(alpha log pi - value(s, a_pi)) + bc_weight * behaviour cloning loss + preactivation_weight * squared length of the mode before
-      tanh; the value is the mean over critics and quantiles (tqc), the least critic's (sac; with REDQ's subsets the mean over critics) or the
-      first one's (td3, ddpg). With `relative_value` it is divided by its size, and there is no alpha in the critics' targets, whose units are
-      others.
+    Actor: mean(alpha log pi - value(s, a_pi)) + bc_weight * behaviour cloning loss; the value is the mean over critics and quantiles (tqc), or the
+      least critic's (sac; with REDQ's subsets the mean over critics).
 
     Args:
       key: random key.
@@ -133,7 +118,7 @@ def update(key: Array, state: AgentState, batch: Transition, schedule: Schedule,
     blocks = num_blocks(batch.action.shape[0], max(config.agent.net_arch))
     columns, target_critics = _prepare(key, state, batch, config)
     gradient, critic_metrics = mean_over_blocks(functools.partial(_critic_gradient, state, target_critics, config), columns, blocks)
-    critics, critic_optimiser = _descend(gradient, state.critic_optimiser, state.critics, schedule.learning_rate)
+    critics, critic_optimiser = _descend(gradient, state.critic_optimiser, state.critics, config.agent.learning_rate)
     state = state.replace(
         critics=critics,
         critic_optimiser=critic_optimiser,
@@ -141,10 +126,8 @@ def update(key: Array, state: AgentState, batch: Transition, schedule: Schedule,
     )
 
     gradient, actor_metrics = mean_over_blocks(functools.partial(_actor_gradient, state, schedule, config), columns, blocks)
-    moved, alpha_metrics = _move_actor(state, gradient, actor_metrics["actor/entropy"], schedule, config)
-    if config.agent.base == "td3":
-        moved = tree_where(critic_optimiser.count % _TD3_ACTOR_DELAY == 0, moved, state)
-    return moved, {**critic_metrics, **actor_metrics, **alpha_metrics, "batch/reward": jnp.sum(batch.reward)}
+    state, alpha_metrics = _move_actor(state, gradient, actor_metrics["actor/entropy"], schedule, config)
+    return state, {**critic_metrics, **actor_metrics, **alpha_metrics, "batch/reward": jnp.sum(batch.reward)}
 
 
 def td_error(key: Array, state: AgentState, batch: Transition, config: TrainConfig) -> Array:
@@ -168,7 +151,6 @@ def _prepare(key: Array, state: AgentState, batch: Transition, config: TrainConf
         reward=batch.reward,
         discount=batch.discount,
         is_demonstration=batch.is_demonstration,
-        obtained_return=batch.obtained_return,
         weight=batch.weight,
         noise=jax.random.normal(key_actor, action.shape),
         next_noise=jax.random.normal(key_next, action.shape),
@@ -182,33 +164,15 @@ def _prepare(key: Array, state: AgentState, batch: Transition, config: TrainConf
 
 def _targets(state: AgentState, target_critics: Params, config: TrainConfig, block: _Columns) -> Array:
     """What the critics of each column are moved towards: (M, B) target atoms, or (1, B) without quantiles."""
-    next_action, entropy_bonus = _next_action(state, config, block)
+    next_action, log_prob = apply_actor(state.actor, block.next_inputs, config.agent, action_dim=block.action.shape[0]).at(block.next_noise)
     next_atoms = apply_critics(target_critics, block.next_inputs, next_action, config.agent)  # (C, Q, B)
-    bellman = dict(reward=block.reward, discount=block.discount, entropy_bonus=entropy_bonus)
+    bellman = dict(reward=block.reward, discount=block.discount, entropy_bonus=-jnp.exp(state.log_alpha) * log_prob)
     if config.agent.base == "tqc":
         num_dropped = next_atoms.shape[0] * config.agent.top_quantiles_to_drop_per_net
         targets = target_atoms(next_atoms.reshape(-1, next_atoms.shape[-1]), **bellman, num_dropped=num_dropped)
     else:
         targets = target_value(next_atoms[:, 0], **bellman)
-    if config.agent.clip_targets:
-        targets = jnp.clip(targets, 0.0, 1.0)
-    if block.obtained_return is not None:
-        targets = jnp.maximum(targets, block.obtained_return[None])
-    return targets
-
-
-def _next_action(state: AgentState, config: TrainConfig, block: _Columns) -> tuple[Array, Array]:
-    """The actions (A, B) that the targets assume at the ends of the transitions, and the bonus (B,) for their entropy."""
-    agent, action_dim = config.agent, block.action.shape[0]
-    if agent.has_entropy:
-        action, log_prob = apply_actor(state.actor, block.next_inputs, agent, action_dim=action_dim).at(block.next_noise)
-        weight = 0.0 if agent.relative_value else jnp.exp(state.log_alpha)
-        return action, -weight * log_prob
-    action = apply_actor(state.target_actor, block.next_inputs, agent, action_dim=action_dim).mode
-    if agent.base == "td3":
-        noise = jnp.clip(agent.target_noise * block.next_noise, -agent.target_noise_clip, agent.target_noise_clip)
-        action = jnp.clip(action + noise, -1.0, 1.0)
-    return action, jnp.zeros(action.shape[1])
+    return jnp.clip(targets, 0.0, 1.0) if config.agent.clip_targets else targets
 
 
 def _critic_gradient(state: AgentState, target_critics: Params, config: TrainConfig, block: _Columns) -> tuple[Params, Metrics]:
@@ -228,10 +192,8 @@ def _value(critics: Params, inputs: Array, action: Array, config: TrainConfig) -
     """What the actor climbs: (B,)."""
     if config.agent.base == "tqc":
         return mean_return(critics, inputs, action, config.agent)
-    if config.agent.base == "sac":
-        values = apply_critics(critics, inputs, action, config.agent)[:, 0]
-        return jnp.min(values, axis=0) if config.agent.num_target_critics is None else jnp.mean(values, axis=0)
-    return apply_critics(jax.tree.map(lambda leaf: leaf[:1], critics), inputs, action, config.agent)[0, 0]
+    values = apply_critics(critics, inputs, action, config.agent)[:, 0]
+    return jnp.min(values, axis=0) if config.agent.num_target_critics is None else jnp.mean(values, axis=0)
 
 
 def _actor_gradient(state: AgentState, schedule: Schedule, config: TrainConfig, block: _Columns) -> tuple[Params, Metrics]:
@@ -241,19 +203,13 @@ def _actor_gradient(state: AgentState, schedule: Schedule, config: TrainConfig, 
     def loss(actor: Params) -> tuple[Array, Metrics]:
         distribution = apply_actor(actor, block.inputs, agent, action_dim=block.action.shape[0])
         action, log_prob = distribution.at(block.noise)
-        if not agent.has_entropy:
-            action, log_prob = distribution.mode, jnp.zeros(block.reward.shape)
-        values = _value(state.critics, block.inputs, action, config)
-        value, entropy = jnp.mean(values), -jnp.mean(log_prob)
+        value, entropy = jnp.mean(_value(state.critics, block.inputs, action, config)), -jnp.mean(log_prob)
         clonable = block.is_demonstration
         if agent.q_filter:
             own = _value(state.critics, block.inputs, jax.lax.stop_gradient(distribution.mode), config)
             clonable &= _value(state.critics, block.inputs, block.action, config) > own
         bc = behaviour_cloning(distribution.mode if quirks.bc_action == "mean" else action, block.action, clonable, form=quirks.bc_loss)
-        climbed = jnp.mean(values / jax.lax.stop_gradient(jnp.maximum(values, _LEAST_VALUE))) if agent.relative_value else value
-        total = -jnp.exp(state.log_alpha) * entropy - climbed + schedule.bc_weight * bc
-        if agent.preactivation_weight > 0.0:
-            total += agent.preactivation_weight * jnp.mean(jnp.sum(jnp.square(distribution.mean), axis=0))
+        total = -jnp.exp(state.log_alpha) * entropy - value + agent.bc_weight * bc
         return total, {"actor/loss": total, "actor/bc_loss": bc, "actor/value": value, "actor/entropy": entropy}
 
     return jax.grad(loss, has_aux=True)(state.actor)
@@ -265,27 +221,21 @@ def _descend(gradient: Any, optimiser_state: optax.OptState, params: Any, learni
 
 
 def _move_actor(state: AgentState, gradient: Params, entropy: Array, schedule: Schedule, config: TrainConfig) -> tuple[AgentState, Metrics]:
-    """The actor's step, and that of what depends on it: what follows it, and the entropy coefficient."""
+    """The step of the actor, of its average, and of the entropy coefficient."""
     state = _step_actor(state, gradient, schedule, config)
-    if not config.agent.has_entropy:
-        return state, {}
     loss, gradient = jax.value_and_grad(entropy_coefficient)(state.log_alpha, -entropy, target_entropy=schedule.target_entropy)
-    log_alpha, alpha_optimiser = _descend(gradient, state.alpha_optimiser, state.log_alpha, schedule.learning_rate)
+    log_alpha, alpha_optimiser = _descend(gradient, state.alpha_optimiser, state.log_alpha, config.agent.learning_rate)
     metrics = {"alpha/loss": loss, "alpha/value": jnp.exp(state.log_alpha)}
     return state.replace(log_alpha=log_alpha, alpha_optimiser=alpha_optimiser), metrics
 
 
 def _step_actor(state: AgentState, gradient: Params, schedule: Schedule, config: TrainConfig) -> AgentState:
-    """The actor's step, and one move of what follows it: its average and, where there is one, its target."""
-    actor, actor_optimiser = _descend(gradient, state.actor_optimiser, state.actor, schedule.learning_rate)
-    target_actor = state.target_actor
-    if target_actor is not None:
-        target_actor = optax.incremental_update(actor, target_actor, config.agent.target_update_rate)
+    """The actor's step, and one move of its average."""
+    actor, actor_optimiser = _descend(gradient, state.actor_optimiser, state.actor, config.agent.learning_rate)
     return state.replace(
         actor=actor,
         actor_optimiser=actor_optimiser,
         average_actor=optax.incremental_update(actor, state.average_actor, schedule.actor_average_rate),
-        target_actor=target_actor,
     )
 
 
@@ -294,9 +244,9 @@ def update_bc(key: Array, state: AgentState, batch: Transition, schedule: Schedu
 
     Args:
       key: random key, for the quirk `bc_action = sample`.
-      state: the agent; only the actor, what follows it, and its optimiser change.
+      state: the agent; only the actor, its average, and its optimiser change.
       batch: B demonstration transitions.
-      schedule: its learning rate and averaging rate are used.
+      schedule: its averaging rate is used.
       config: static; the quirks `bc_loss` and `bc_action` have their say.
 
     Returns:

@@ -7,10 +7,10 @@
     task_conditioned    any goal reached in the demonstrations (eq. 4.2)
     joint_intersection  a goal reached later in that episode that lies within epsilon of a demonstrated one, or the demonstrated one itself
 
-The strategy joint_union takes task_conditioned with probability `union_sampling_ratio`, else future (eq. 4.4); mixture takes any sources with any
-weights. A row whose intersection is empty is not relabelled. For intersections, the replay notes for each transition a demonstrated goal near its end
-(`NEARBY_GOAL`), which makes them, "exceptionally slow" in the thesis, nearly as cheap as the others. Difference from HinDRL in the form that takes
-demonstrated goals: one goal near each state is noted for good, so a goal is drawn by the states that it lies near.
+The strategy joint_union takes task_conditioned with probability `union_sampling_ratio`, else future (eq. 4.4). A row whose intersection is empty
+is not relabelled. For intersections, the replay notes for each transition a demonstrated goal near its end (`NEARBY_GOAL`), which makes them,
+"exceptionally slow" in the thesis, nearly as cheap as the others. Difference from HinDRL in the form that takes demonstrated goals: one goal near
+each state is noted for good, so a goal is drawn by the states that it lies near.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Performance-critical forms: truncation and the quantile Huber loss in two forms each, products in bfloat16, and batches cut into blocks.
+"""Performance-critical forms: truncation and the quantile Huber loss in two forms each, and batches cut into blocks.
 
 Atoms (quantiles) lie on the leading axes and the batch on the last: on a CPU that layout, not the arithmetic, decides the speed. The two forms have
 equal results and are chosen where the program is compiled: loops over the atoms, which keep a CPU's cache and vector units busy, and whole-array
@@ -118,31 +118,6 @@ def _quantile_huber_backward(residuals: tuple[Array, Array], cotangent: Array) -
 
 
 quantile_huber.defvjp(_quantile_huber_forward, _quantile_huber_backward)
-
-
-@jax.custom_vjp
-def bfloat16_product(kernel: Array, features: Array) -> Array:
-    """kernel^T features, (in, out) and (in, B) -> (out, B), from operands rounded to bfloat16, summed in float32, in both directions."""
-    return _bfloat16_forward(kernel, features)[0]
-
-
-def _dot(a: Array, b: Array, *, contract: tuple[int, int]) -> Array:
-    return jax.lax.dot_general(a, b, (((contract[0],), (contract[1],)), ((), ())), preferred_element_type=jnp.float32)
-
-
-def _bfloat16_forward(kernel: Array, features: Array) -> tuple[Array, tuple[Array, Array]]:
-    kernel, features = kernel.astype(jnp.bfloat16), features.astype(jnp.bfloat16)
-    # The barrier keeps the transposition out of the product, whose fast form on a CPU takes row-major operands.
-    return _dot(jax.lax.optimization_barrier(kernel.T), features, contract=(1, 0)), (kernel, features)
-
-
-def _bfloat16_backward(residuals: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
-    kernel, features = residuals
-    cotangent = cotangent.astype(jnp.bfloat16)
-    return _dot(features, cotangent, contract=(1, 1)), _dot(kernel, cotangent, contract=(1, 0))
-
-
-bfloat16_product.defvjp(_bfloat16_forward, _bfloat16_backward)
 
 
 _BLOCK_BYTES = 2**19

@@ -15,7 +15,6 @@ from flax import struct
 
 from hindrl_jax.base.types import Array
 from hindrl_jax.config import AgentConfig
-from hindrl_jax.core.kernels import bfloat16_product
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 _KERNEL_INIT = nn.initializers.variance_scaling(1.0 / 3.0, "fan_in", "uniform")  # U(-b, b), b = 1 / sqrt(fan_in), as in the thesis's framework
@@ -27,14 +26,12 @@ class Dense(nn.Module):
     """Affine layer along the leading axis: (in, B) -> (width, B)."""
 
     width: int
-    bfloat16: bool
 
     @nn.compact
     def __call__(self, features: Array) -> Array:
         kernel = self.param("kernel", _KERNEL_INIT, (features.shape[0], self.width))
         bias = self.param("bias", nn.initializers.zeros, (self.width,))
-        product = bfloat16_product(kernel, features) if self.bfloat16 else kernel.T @ features
-        return product + bias[:, None]
+        return kernel.T @ features + bias[:, None]
 
 
 class MLP(nn.Module):
@@ -43,16 +40,15 @@ class MLP(nn.Module):
     net_arch: tuple[int, ...]
     out_dim: int
     layer_norm: bool = False
-    bfloat16: bool = False
 
     @nn.compact
     def __call__(self, features: Array) -> Array:
         for width in self.net_arch:
-            features = Dense(width, self.bfloat16)(features)
+            features = Dense(width)(features)
             if self.layer_norm:
                 features = nn.LayerNorm(reduction_axes=0, feature_axes=0)(features)
             features = nn.relu(features)
-        return Dense(self.out_dim, self.bfloat16)(features)
+        return Dense(self.out_dim)(features)
 
 
 class ActionDistribution(struct.PyTreeNode, kw_only=True):
@@ -80,11 +76,11 @@ class ActionDistribution(struct.PyTreeNode, kw_only=True):
 
 
 def _actor(config: AgentConfig, action_dim: int) -> MLP:
-    return MLP(net_arch=config.net_arch, out_dim=2 * action_dim, bfloat16=config.network_precision == "bfloat16")
+    return MLP(net_arch=config.net_arch, out_dim=2 * action_dim)
 
 
 def _critic(config: AgentConfig, out_dim: int) -> MLP:
-    return MLP(net_arch=config.net_arch, out_dim=out_dim, layer_norm=config.layer_norm, bfloat16=config.network_precision == "bfloat16")
+    return MLP(net_arch=config.net_arch, out_dim=out_dim, layer_norm=config.layer_norm)
 
 
 def init_actor(key: Array, config: AgentConfig, *, input_dim: int, action_dim: int) -> Params:

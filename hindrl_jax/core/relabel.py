@@ -49,7 +49,6 @@ def reward_by_goal(steps: Steps, chosen: Array, test: GoalTest) -> Steps:
     return steps.replace(
         rewards=jnp.where(chosen[:, None], reached.astype(jnp.float32), steps.rewards),
         ends=steps.ends | reached if test.ends_return else steps.ends,
-        has_recorded_rewards=steps.has_recorded_rewards & ~chosen,
     )
 
 
@@ -80,6 +79,5 @@ def relabel_observations(key: Array, replay: ReplayState, steps: Steps, chosen: 
         rewards=jnp.where(chosen[:, None], solved.astype(jnp.float32), steps.rewards),
         terminated=steps.terminated & ~chosen,  # where the recorded task was solved, the relabelled one may go on
         ends=steps.ends | solved,
-        has_recorded_rewards=steps.has_recorded_rewards & ~chosen,
         is_relabelled=chosen,
     )

@@ -89,7 +89,7 @@ def reset(key: Array, env: Steppable, behavioural_goals: GoalTable, num_envs: in
     )
 
 
-def step(rollout: RolloutState, restarted: RolloutState, action: Array, env: Steppable, *, cut: Array | None = None) -> tuple[RolloutState, TimeStep]:
+def step(rollout: RolloutState, restarted: RolloutState, action: Array, env: Steppable) -> tuple[RolloutState, TimeStep]:
     """Steps every environment, and goes on from a new episode where one has ended.
 
     Args:
@@ -97,14 +97,11 @@ def step(rollout: RolloutState, restarted: RolloutState, action: Array, env: Ste
       restarted: E new episodes from `reset`; those that are not needed are dropped.
       action: (E, A) in [-1, 1].
       env: static.
-      cut: (E,) bool, episodes to be truncated after this step, unless it ends them.
 
     Returns:
       The new state, and the time steps (E, ...) before the resets: their observation is the true next one.
     """
     env_state, time_step = jax.vmap(env.step)(rollout.env_state, action_to_env(action, env))
-    if cut is not None:
-        time_step = time_step.replace(truncated=time_step.truncated | (cut & ~time_step.terminated))
     continued = rollout.replace(env_state=env_state, observation=time_step.observation)
     return tree_where(time_step.terminated | time_step.truncated, restarted, continued), time_step
 

@@ -27,10 +27,7 @@ class Steps(struct.PyTreeNode, kw_only=True):
     inside: Array  # (B, n) bool, whether the episode was not over before
     is_last: Array  # (B, n) bool, whether it is over after
     terminated: Array  # (B,) bool, whether its end is a termination, rather than a truncation
-    steps_left: Array  # (B,) int32, from the first of these steps to the last one of the episode
-    last_reward: Array  # (B,), at the last step of the episode
     ends: Array  # (B, n) bool, whether the return ends there because a goal is reached
-    has_recorded_rewards: Array  # (B,) bool; else they are computed from goals, of which the episode's last reward says nothing
     is_relabelled: Array  # (B,) bool, whether the goal, or the observations, are those of hindsight
 
 
@@ -58,10 +55,7 @@ def read_steps(episodes: Episodes, rows: Array, steps: Array, n_step: int) -> St
         inside=inside,
         is_last=window == lengths[:, None] - 1,
         terminated=episodes.terminated[rows],
-        steps_left=lengths - 1 - steps,
-        last_reward=episodes.rewards[rows, lengths - 1],
         ends=jnp.zeros_like(inside),
-        has_recorded_rewards=jnp.ones(rows.shape, bool),
         is_relabelled=jnp.zeros(rows.shape, bool),
     )
 
@@ -74,7 +68,7 @@ def transitions(steps: Steps, achieved_goal: Callable[[Array], Array], config: T
     Args:
       steps: B rows of n steps.
       achieved_goal: projection of observations (..., D) to goals (..., G).
-      config: gamma, `timeouts_are_terminal` and `bound_by_obtained_return`.
+      config: gamma and `timeouts_are_terminal`.
       is_demonstration: marks the rows for the behaviour cloning loss.
 
     Returns:
@@ -89,7 +83,6 @@ def transitions(steps: Steps, achieved_goal: Callable[[Array], Array], config: T
     discounts = gamma ** jnp.arange(ends.shape[1], dtype=jnp.float32)
     last = (num_steps - 1)[:, None]
     next_observation = jnp.take_along_axis(steps.next_observations, last[..., None], axis=1)[:, 0]
-    obtained = jnp.where(steps.has_recorded_rewards, steps.last_reward * gamma ** steps.steps_left.astype(jnp.float32), 0.0)
     return Transition(
         observation=steps.observation,
         achieved_goal=achieved_goal(steps.observation),
@@ -101,5 +94,4 @@ def transitions(steps: Steps, achieved_goal: Callable[[Array], Array], config: T
         desired_goal=steps.desired_goal,
         is_demonstration=jnp.full(num_steps.shape, is_demonstration),
         is_relabelled=steps.is_relabelled,
-        obtained_return=obtained if config.batch.bound_by_obtained_return else None,
     )

@@ -26,7 +26,7 @@ from hindrl_jax.core.hindsight import NEARBY_GOAL, hindsight_steps
 from hindrl_jax.core.inputs import network_inputs
 from hindrl_jax.core.replay import RecordedStep, ReplayState
 from hindrl_jax.core.rollout import Act, DemoResets, Evaluation, RolloutState
-from hindrl_jax.core.schedules import Schedule, linear, schedule
+from hindrl_jax.core.schedules import Schedule, schedule
 
 
 class TrainState(struct.PyTreeNode, kw_only=True):
@@ -118,17 +118,16 @@ def _with_achieved_goals(key: Array, episodes: RolloutState, state: TrainState, 
     """New episodes, a share of which are given a goal from the replay and are judged by it; none before the replay holds an episode."""
     key_choice, key_row, key_step = jax.random.split(key, 3)
     past, num_envs = state.replay, config.num_envs
-    share = linear(config.goal.achieved_goal_ratio, config.goal.final_achieved_goal_ratio, _progress(state, config))
     rows = replay.sample_episodes(key_row, past, num_envs)
     steps = hindsight_steps(key_step, jnp.zeros_like(rows), past.episodes.lengths[rows], source="episode")
-    chosen = jax.random.bernoulli(key_choice, share, (num_envs,)) & (jnp.sum(past.num_complete) > 0)
+    chosen = jax.random.bernoulli(key_choice, config.goal.achieved_goal_ratio, (num_envs,)) & (jnp.sum(past.num_complete) > 0)
     achieved = env.achieved_goal(past.episodes.observations[rows, steps])
     return episodes.replace(desired_goal=jnp.where(chosen[:, None], achieved, episodes.desired_goal), notes={REWARDED_BY_GOAL: chosen})
 
 
 def _progress(state: TrainState, config: TrainConfig) -> Array:
     """() share of the run that is over."""
-    return jnp.minimum(state.env_steps / config.steps, 1.0)
+    return jnp.minimum(state.env_steps / config.num_steps, 1.0)
 
 
 def _agent_schedule(state: TrainState, updates: Array, env: Environment, config: TrainConfig) -> Schedule:
@@ -160,12 +159,12 @@ def warm_up_iterations(env: Environment, config: TrainConfig) -> int:
     return max(-(-config.learning_starts // config.steps_per_iteration), env.horizon)
 
 
-def make_policy(policy: Policy, env: Environment, config: TrainConfig, *, stochastic: bool) -> Act:
-    """The policy as a function of observations and goals: sampled actions, or the mean ones."""
+def make_policy(policy: Policy, env: Environment, config: TrainConfig) -> Act:
+    """The policy as a function of observations and goals."""
 
     def act(key: Array, observation: Array, desired_goal: Array) -> Array:
         inputs = network_inputs(observation, env.achieved_goal(observation), desired_goal, policy.scale, config)
-        return agents.select_action(key, policy.actor, inputs, config, action_dim=env.action_dim, stochastic=stochastic)
+        return agents.select_action(key, policy, inputs, config, action_dim=env.action_dim)
 
     return act
 
@@ -181,14 +180,11 @@ def act_at_random(env: Environment) -> Act:
 
 def _interact(key: Array, state: TrainState, guidance: Guidance, env: Steppable, config: TrainConfig, act: Act) -> TrainState:
     """One step of every environment, stored in the replay."""
-    key_act, key_reset, key_goals, key_nearby, key_cut = jax.random.split(key, 5)
+    key_act, key_reset, key_goals, key_nearby = jax.random.split(key, 4)
     before = state.rollout
     action = act(key_act, before.observation, before.desired_goal)
     begun = _with_notes(_new_episodes(key_reset, guidance, env, config, _progress(state, config)), config)
-    cut = None
-    if config.random_truncation > 0.0:
-        cut = jax.random.bernoulli(key_cut, config.random_truncation, (config.num_envs,))
-    after, time_step = rollout.step(before, begun, action, env, cut=cut)
+    after, time_step = rollout.step(before, begun, action, env)
     state = record(key_nearby, state, (action, time_step), guidance, env, config)
     return continue_from(key_goals, state, after, time_step, env, config)
 
@@ -256,7 +252,7 @@ def learn(
 
     def iteration(state: TrainState, _: None) -> tuple[TrainState, Metrics]:
         key, key_interact, key_batch, key_updates = jax.random.split(state.key, 4)
-        act = make_policy(agents.policy(state.agent, average=False), env, config, stochastic=True)
+        act = make_policy(agents.policy(state.agent, average=False), env, config)
         after = _interact(key_interact, state.replace(key=key), guidance, env, config, act)
         state = after.replace(sampler=sampler.record(state.sampler, state.replay, after.replay))
         batches, drawn = sampler.draw(key_batch, state, guidance)
@@ -288,8 +284,7 @@ def clone(state: TrainState, guidance: Guidance, *, env: Environment, config: Tr
     def gradient_step(state: TrainState, _: None) -> tuple[TrainState, Metrics]:
         key, key_batch, key_update = jax.random.split(state.key, 3)
         batch = sample_demonstrations(key_batch, guidance.demonstrations, env, config)
-        progress = 0.0 if config.learns_from_rollouts else jnp.minimum(state.updates / config.steps, 1.0)
-        moment = schedule(progress, state.updates, config.agent, action_dim=env.action_dim)
+        moment = schedule(0.0, state.updates, config.agent, action_dim=env.action_dim)
         agent, metrics = agents.update_bc(key_update, state.agent, batch, moment, config)
         return state.replace(agent=agent, key=key, updates=state.updates + 1), metrics
 
@@ -298,5 +293,5 @@ def clone(state: TrainState, guidance: Guidance, *, env: Environment, config: Tr
 
 
 def evaluate(key: Array, policy: Policy, guidance: Guidance, *, env: Steppable, config: TrainConfig, num_episodes: int) -> Evaluation:
-    """Plays fresh episodes with the policy's mean actions, see `rollout.evaluate`."""
-    return rollout.evaluate(key, env, guidance.behavioural_goals, make_policy(policy, env, config, stochastic=False), num_episodes)
+    """Plays fresh episodes with the policy, see `rollout.evaluate`."""
+    return rollout.evaluate(key, env, guidance.behavioural_goals, make_policy(policy, env, config), num_episodes)

@@ -83,7 +83,7 @@ def _curves(result: Result) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _mark_events(axis: Any, result: Result) -> None:
     """Where the agent began anew, and the policies that are returned."""
     for share in result.config.agent_resets:
-        axis.axvline(share * result.config.steps, color="0.7", linestyle=":", linewidth=1)
+        axis.axvline(share * result.config.num_steps, color="0.7", linestyle=":", linewidth=1)
     if result.returned is not None:
         steps = result.returned.env_steps if result.config.learns_from_rollouts else result.returned.updates
         axis.scatter(steps, 100 * result.returned.success, s=18, color=RETURNED, marker="o", zorder=5, label="returned")

@@ -82,7 +82,8 @@ def remarks(compared: Sequence[Comparison]) -> list[str]:
     for run in runs:
         if not run.finished:
             done, unit = (run.updates, "updates") if run.cloning else (run.env_steps, "steps")
-            lines.append(f"{run.label} is not finished: its success is that of the evaluation at {done[-1]:,} of {run.spec.config.steps:,} {unit}")
+            moment = f"{done[-1]:,} of {run.spec.config.num_steps:,} {unit}"
+            lines.append(f"{run.label} is not finished: its success is that of the evaluation at {moment}")
     if len({(run.spec.env.name, json.dumps(dataclasses.asdict(run.spec.env), default=str)) for run in runs}) > 1:
         lines.append("the runs are of different environments: what they differ by is the task as well as the method")
     if any(run.cloning for run in runs) and not all(run.cloning for run in runs):

@@ -41,7 +41,7 @@ class ProgressBar:
 
     def __call__(self, result: Result) -> None:
         """Brings everything up to date."""
-        tenths = math.floor(self._lines * result.steps_done / result.config.steps)
+        tenths = math.floor(self._lines * result.steps_done / result.config.num_steps)
         if self._rows_seen is None or len(result.rows) < self._rows_seen:  # a training begins, or goes on after an interruption
             self._began, self._rows_seen, self._lines_said = None, len(result.rows), tenths
         if len(result.rows) > self._rows_seen:
@@ -117,7 +117,7 @@ def bar(result: Result, began: tuple[int, float] | None, *, width: int, unicode:
       width: characters that there is room for.
       unicode: draw with more than ASCII.
     """
-    done, total = min(result.steps_done, result.config.steps), result.config.steps
+    done, total = min(result.steps_done, result.config.num_steps), result.config.num_steps
     unit = "steps" if result.config.learns_from_rollouts else "updates"
     words = f" {done:,}/{total:,} {unit}"
     success = result.latest_success()

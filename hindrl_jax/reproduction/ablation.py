@@ -82,7 +82,7 @@ shows a difference by chance.
 
 def _as_text(outcomes: Sequence[Outcome]) -> str:
     spec = outcomes[0].cell.spec
-    lines = [_EXPLANATION.format(seeds=len(spec.seeds), first=spec.seeds[0], steps=spec.config.steps) + EXPLANATION.format(baseline="default")]
+    lines = [_EXPLANATION.format(seeds=len(spec.seeds), first=spec.seeds[0], steps=spec.config.num_steps) + EXPLANATION.format(baseline="default")]
     lines += markdown(outcomes, row_name="change", title=lambda task: TASKS[task].title())
     lines += ["## The changes", "", "| change | what it is |", "|---|---|"]
     shown = {outcome.cell.name for outcome in outcomes}

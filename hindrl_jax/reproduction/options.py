@@ -27,7 +27,7 @@ class Option:
 
 def half_of_the_run(config: TrainConfig) -> int:
     """Environment steps after which the run is half over."""
-    return config.steps // 2
+    return config.num_steps // 2
 
 
 RECIPE = TrainConfig(
@@ -39,7 +39,7 @@ RECIPE = TrainConfig(
     batch=BatchConfig(max_demo_ratio=0.25),
     goal=GoalConfig(epsilon_steps=0),
     agent=AgentConfig(
-        net_arch=(64, 64, 64, 64), layer_norm=False, clip_targets=False, target_entropy=-1.0, final_target_entropy=-10.0, bc_weight=0.01
+        net_arch=(64, 64, 64, 64), layer_norm=False, clip_targets=False, target_entropy=-0.2, final_target_entropy=-2.0, bc_weight=0.01
     ),
     quirks=QuirksConfig(bc_loss="squared"),
 )
@@ -49,20 +49,6 @@ BASELINE = Option("default", "baseline", "the recipe as it is", ())
 
 OPTIONS: tuple[Option, ...] = (
     Option("sac", "algorithm", "SAC in place of TQC", (("agent.base", "sac"),)),
-    Option("td3", "algorithm", "TD3 in place of TQC, with its delayed actor", (("agent.base", "td3"),)),
-    Option("ddpg", "algorithm", "DDPG in place of TQC, as DDPGfD and the HinDRL paper have it", (("agent.base", "ddpg"), ("agent.num_critics", 1))),
-    Option(
-        "td3-preactivation",
-        "algorithm",
-        "as td3, with the mode before tanh kept small by a weight of 0.003 (HER)",
-        (("agent.base", "td3"), ("agent.preactivation_weight", 0.003)),
-    ),
-    Option(
-        "ddpg-preactivation",
-        "algorithm",
-        "as ddpg, with the mode before tanh kept small by a weight of 0.003 (HER)",
-        (("agent.base", "ddpg"), ("agent.num_critics", 1), ("agent.preactivation_weight", 0.003)),
-    ),
     Option("goals-final", "hindsight", "relabelled with the rollout's last goal (HER)", (("batch.hindrl_sampling_strategy", "final"),)),
     Option("goals-future", "hindsight", "relabelled with goals later in the rollout (HER)", (("batch.hindrl_sampling_strategy", "future"),)),
     Option("goals-episode", "hindsight", "relabelled with any goal of the rollout (HER)", (("batch.hindrl_sampling_strategy", "episode"),)),
@@ -108,19 +94,13 @@ OPTIONS: tuple[Option, ...] = (
     Option(
         "achieved-goals",
         "goals",
-        "as goals-joint-union, and half of the rollouts, falling to none, aim at states reached earlier (thesis, chapter 6)",
-        (("goal.achieved_goal_ratio", 0.5), ("goal.final_achieved_goal_ratio", 0.0), ("batch.hindrl_sampling_strategy", "joint_union")),
+        "as goals-joint-union, and half of the rollouts aim at states reached earlier (thesis, chapter 6)",
+        (("goal.achieved_goal_ratio", 0.5), ("batch.hindrl_sampling_strategy", "joint_union")),
     ),
     Option("n-step-1", "targets", "1-step returns in place of 5 (thesis)", (("batch.n_step", 1),)),
     Option("n-step-3", "targets", "3-step returns in place of 5", (("batch.n_step", 3),)),
     Option("gamma-0.99", "targets", "discount 0.99 in place of 0.98 (thesis)", (("batch.gamma", 0.99),)),
     Option("clip-targets", "targets", "targets clipped to [0, 1] (HER)", (("agent.clip_targets", True),)),
-    Option(
-        "bound-targets",
-        "targets",
-        "as clip-targets, and targets at least the return obtained (self-imitation learning)",
-        (("batch.bound_by_obtained_return", True), ("agent.clip_targets", True)),
-    ),
     Option(
         "timeouts-terminal",
         "targets",
@@ -138,14 +118,12 @@ OPTIONS: tuple[Option, ...] = (
     Option("bc-0", "demonstrations", "no cloning loss", (("agent.bc_weight", 0.0),)),
     Option("bc-0.1", "demonstrations", "cloning loss with weight 0.1 in place of 0.01", (("agent.bc_weight", 0.1),)),
     Option("bc-1", "demonstrations", "cloning loss with weight 1 in place of 0.01 (thesis)", (("agent.bc_weight", 1.0),)),
-    Option("bc-fades", "demonstrations", "the weight of the cloning loss falls to 0 along the run", (("agent.final_bc_weight", 0.0),)),
     Option(
         "q-filter",
         "demonstrations",
         "as bc-0.1, where the critics prefer the demonstrated action (Nair et al.)",
         (("agent.q_filter", True), ("agent.bc_weight", 0.1)),
     ),
-    Option("value-relative", "demonstrations", "value in the actor's loss over its own size, row by row", (("agent.relative_value", True),)),
     Option("bc-warm-start", "demonstrations", "500 gradient steps of cloning before the first of reinforcement learning", (("bc_warm_start", 500),)),
     Option("bc-norm", "demonstrations", "cloning loss is the distance, not its square (original code)", (("quirks.bc_loss", "norm"),)),
     Option("bc-sample", "demonstrations", "cloning loss of a sampled action, not of the mean one (original code)", (("quirks.bc_action", "sample"),)),
@@ -168,23 +146,9 @@ OPTIONS: tuple[Option, ...] = (
     Option("redq", "critic", "5 critics, of which 2 at random make the targets (REDQ)", (("agent.num_critics", 5), ("agent.num_target_critics", 2))),
     Option("no-truncation", "critic", "no quantiles dropped from the targets", (("agent.top_quantiles_to_drop_per_net", 0),)),
     Option("target-rate-0.005", "critic", "target critics follow at 0.005 in place of 0.02 (TQC)", (("agent.target_update_rate", 0.005),)),
-    Option(
-        "preactivation",
-        "actor",
-        "the mode before tanh kept small by a weight of 0.003 on its squared length (HER)",
-        (("agent.preactivation_weight", 0.003),),
-    ),
     Option("alpha-1", "actor", "the entropy coefficient starts at 1 in place of 0.002 (SAC)", (("agent.initial_alpha", 1.0),)),
     Option("entropy-constant", "actor", "the target entropy stays at -1, it does not fall to -10", (("agent.final_target_entropy", None),)),
-    Option(
-        "no-actor-average",
-        "actor",
-        "the actor itself is evaluated, not its running average",
-        (("agent.actor_average_rate", 1.0), ("agent.actor_average_span", 0.0)),
-    ),
-    Option(
-        "actor-average-short", "actor", "the actor's average spans about 500 gradient steps, all along the run", (("agent.actor_average_span", 0.0),)
-    ),
+    Option("no-actor-average", "actor", "the actor itself is evaluated, not its running average", (("agent.actor_average_span", 0.0),)),
     Option("inputs-raw", "inputs", "networks see inputs as they are (thesis)", (("agent.input_encoding", "raw"),)),
     Option("inputs-standardised", "inputs", "networks see standardised inputs", (("agent.input_encoding", "standardised"),)),
     Option(
@@ -194,7 +158,6 @@ OPTIONS: tuple[Option, ...] = (
         (("priority.priority_exponent", 0.6), ("priority.demo_priority_bonus", 1.0)),
     ),
     Option("batch-1024", "replay", "batches of 1,024 rows in place of 256", (("batch.batch_size", 1_024),)),
-    Option("random-truncation-0.02", "rollout", "training episodes are cut off after a step with probability 0.02", (("random_truncation", 0.02),)),
     Option(
         "environments-64",
         "rollout",

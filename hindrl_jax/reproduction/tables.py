@@ -50,7 +50,7 @@ def _csv_row(outcome: Outcome, row_name: str) -> dict[str, Any]:
         row_name: outcome.cell.name,
         "group": outcome.cell.group,
         "seeds": len(spec.seeds),
-        "steps": spec.config.steps,
+        "steps": spec.config.num_steps,
         "seeds_reaching_95": outcome.seeds_reaching_95,
     }
     for name, field in (("median_steps_to_95", "steps_to_95"), *((name, name) for name in ("final_success", "mean_success", "difference"))):
@@ -81,7 +81,7 @@ def markdown(outcomes: Sequence[Outcome], *, row_name: str, title: Callable[[str
 
 
 def _markdown_row(outcome: Outcome) -> str:
-    steps, limit = outcome.steps_to_95, outcome.cell.spec.config.steps
+    steps, limit = outcome.steps_to_95, outcome.cell.spec.config.num_steps
     difference = f"{100 * outcome.difference.estimate:+.1f} [{100 * outcome.difference.low:+.1f}, {100 * outcome.difference.high:+.1f}]"
     if outcome.is_baseline:
         difference = ""

@@ -31,7 +31,7 @@ from hindrl_jax.base.files import DAMAGED_ARCHIVE, read_arrays, write_atomically
 from hindrl_jax.base.types import Episodes
 from hindrl_jax.training.result import Result, Row
 
-LAYOUT = 2
+LAYOUT = 3
 DEMONSTRATIONS = "demonstrations.npz"
 _ARRAYS = ("guidance", "state", "key", "kept")
 _COUNTERS = ("env_steps", "updates", "train_seconds")

@@ -53,7 +53,7 @@ class Run:
         *,
         episodes: int = 100,
         key: jax.Array | None = None,
-        stochastic: bool = False,
+        noise: float | None = None,
         report: Callable[[int], None] = lambda played: None,
     ) -> list[dict[str, float]]:
         """Plays fresh episodes with each seed's policy: a list of {seed, success, episode_length}, in order of the seeds.
@@ -61,24 +61,24 @@ class Run:
         Args:
           episodes: how many, per seed.
           key: which.
-          stochastic: sample the actions.
+          noise: of the actions, 0 for the mean ones, 1 for sampled ones; None for what the run has found to be best.
           report: called with the number of episodes played so far, all seeds together, where they are played one by one: in robosuite.
         """
         keys = jax.random.split(jax.random.key(0) if key is None else key, len(self.spec.seeds))
-        result = self._trained(stochastic).evaluate(keys, episodes, report)
+        result = self._trained(noise).evaluate(keys, episodes, report)
         return [
             {"seed": seed, "success": float(result.success[i].mean()), "episode_length": float(result.length[i].mean())}
             for i, seed in enumerate(self.spec.seeds)
         ]
 
-    def render(self, path: Path, *, seed: int | None = None, key: jax.Array | None = None, stochastic: bool = False) -> int:
+    def render(self, path: Path, *, seed: int | None = None, key: jax.Array | None = None, noise: float | None = None) -> int:
         """Films fresh episodes of one seed's policy (the first seed's by default); returns how many of them solved the task.
 
         Args:
           path: a .gif or .mp4 file, or a .png file for the last state alone.
           seed: one of the run's seeds.
           key: which episode, or (N,) keys of N episodes to be shown one after the other.
-          stochastic: sample the actions.
+          noise: of the actions, 0 for the mean ones, 1 for sampled ones; None for what the run has found to be best.
 
         Raises:
           UserError: if the run has no such seed, or the film cannot be drawn.
@@ -87,7 +87,7 @@ class Run:
         keys = jnp.atleast_1d(jax.random.key(0) if key is None else key)
         check_film(path, len(keys))
         index = self._index_of(seed)
-        trained = self._trained(stochastic)
+        trained = self._trained(noise)
         if isinstance(env, Watchable):
             pictures, num_solved = trained.film(keys, index)
             with disk_trouble(path):
@@ -98,7 +98,7 @@ class Run:
         draw_episodes(path, env, [episodes.states[0, : int(episodes.lengths[0]) + 1] for episodes in played])
         return sum(bool(episodes.terminated[0]) for episodes in played)
 
-    def play(self, episodes: int = 1, *, seed: int | None = None, key: jax.Array | None = None, stochastic: bool = False) -> Episodes:
+    def play(self, episodes: int = 1, *, seed: int | None = None, key: jax.Array | None = None, noise: float | None = None) -> Episodes:
         """Plays fresh episodes with one seed's policy (the first seed's by default), to be looked at step by step; solved or not.
 
         The policy aims at the first behavioural goal, the end of the first demonstration.
@@ -107,7 +107,7 @@ class Run:
           episodes: N, how many.
           seed: one of the run's seeds.
           key: which.
-          stochastic: sample the actions.
+          noise: of the actions, 0 for the mean ones, 1 for sampled ones; None for what the run has found to be best.
 
         Returns:
           A table of N episodes with their states, repeated after the end.
@@ -115,10 +115,11 @@ class Run:
         Raises:
           UserError: if the run has no such seed.
         """
-        return self._trained(stochastic).play(jax.random.key(0) if key is None else key, self._index_of(seed), episodes)
+        return self._trained(noise).play(jax.random.key(0) if key is None else key, self._index_of(seed), episodes)
 
-    def _trained(self, stochastic: bool) -> TrainedPolicies:
-        return TrainedPolicies(self.spec.env, self.spec.config, self.policies, self.behavioural_goals, stochastic)
+    def _trained(self, noise: float | None) -> TrainedPolicies:
+        policies = self.policies if noise is None else self.policies.replace(noise=jnp.full_like(self.policies.noise, noise))
+        return TrainedPolicies(self.spec.env, self.spec.config, policies, self.behavioural_goals)
 
     def _index_of(self, seed: int | None) -> int:
         """Where a seed, the first one by default, stands among those of the run."""
@@ -164,9 +165,11 @@ def load_run(path: str | os.PathLike[str], *, last: bool = False) -> Run:
     try:
         tree = unflatten_dict({name: jnp.asarray(array) for name, array in read_arrays(file).items()}, sep="/")
         goals = GoalTable(goals=tree["behavioural_goals"]["goals"], count=tree["behavioural_goals"]["count"])
-        # Runs from before policies were kept have one, the last.
-        scale = _input_scale(tree["input_scale"])
-        policies = Policy(actor=tree["last_policy" if last and "last_policy" in tree else "policy"], scale=scale)
+        # Runs from before policies were kept have one, the last; its mean actions are played.
+        actor = tree["last_policy" if last and "last_policy" in tree else "policy"]
+        mean_actions = jnp.zeros(len(spec.seeds))
+        noise = mean_actions if last else tree.get("policy_noise", mean_actions)
+        policies = Policy(actor=actor, scale=_input_scale(tree["input_scale"]), noise=noise)
     except DAMAGED_ARCHIVE as error:
         raise UserError(f"{file} is damaged ({one_line(error)}): train again") from error
     return Run(path=path, spec=spec, policies=policies, behavioural_goals=goals)

@@ -190,6 +190,7 @@ def _save_parameters(path: Path, result: Result) -> None:
     agent, goals, scale = result.state.agent, result.guidance.behavioural_goals, result.state.agent.scale
     tree = {
         "policy": result.returned.actor,
+        "policy_noise": np.asarray(result.returned.noise, np.float32),
         "last_policy": agent.average_actor,
         "actor": agent.actor,
         "critics": agent.critics,

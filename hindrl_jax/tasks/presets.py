@@ -15,7 +15,7 @@ The default is `TrainConfig()`, whatever the task is called. What differs betwee
     relabelling            where episodes have goals of their own, or parameters of the task in their observations, half of the replay rows, with
                            goals of demonstrations and rollouts; where all aim at the same, a fifth, with goals of demonstrations: there, other
                            goals are not what is to be learnt, and take room in the batch
-    target entropy         minus the number of action dimensions
+    target entropy         per action dimension
     random steps           one horizon in each environment
 
 The thesis has settings for the grid worlds and others for the reach tasks.
@@ -80,7 +80,7 @@ def _default(algo: Algorithm, env: Environment) -> TrainConfig:
     """The project's own recipe."""
     goal = _goals(env)
     if algo == "bc":
-        agent = AgentConfig(net_arch=(64, 64), actor_average_span=0.0)
+        agent = AgentConfig(net_arch=(64, 64))
         return TrainConfig(algo="bc", steps=4_000, action_hold=1, eval_every=1_000, batch=BatchConfig(n_step=1), goal=goal, agent=agent)
     return TrainConfig(goal=goal, batch=_MANY_TASKS if _has_many_tasks(env) else BatchConfig())
 
@@ -106,7 +106,7 @@ def _goals(env: Environment) -> GoalConfig:
     return GoalConfig(behavioural_goals="task" if isinstance(env, RelabelsObservations) else "final_demonstration_states")
 
 
-_FRAMEWORK: dict[str, Any] = dict(input_encoding="raw", actor_average_rate=1.0, actor_average_span=0.0)
+_FRAMEWORK: dict[str, Any] = dict(input_encoding="raw", actor_average_span=0.0)
 """How the networks of the thesis's framework are fed and evaluated."""
 
 
@@ -145,11 +145,9 @@ def _thesis(algo: Algorithm, *, reach: bool) -> TrainConfig:
             layer_norm=False,
             clip_targets=False,
             learning_rate=1e-3,
-            final_learning_rate=None,
             top_quantiles_to_drop_per_net=8 if reach else 2,
             target_update_rate=0.005,
             initial_alpha=1.0,
-            target_entropy=None,
             final_target_entropy=None,
             bc_weight=0.0 if reach else 1.0,
             **_FRAMEWORK,

@@ -64,22 +64,20 @@ def check_config(env: Environment, config: TrainConfig) -> None:
     if config.demo_reset_ratio > 0.0 and not (in_jax and isinstance(env, Restorable)):
         missing = "restorable states" if in_jax else "restorable states in JAX"
         raise UserError(f"{name} cannot begin in demonstrated states: it has no {missing}: set demo_reset_ratio to 0")
-    if not in_jax:
-        for field, value, off in (("random_truncation", config.random_truncation, 0.0), ("agent_resets", config.agent_resets, ())):
-            if value:
-                raise UserError(f"{field} = {value} needs a step in JAX, which {name} does not have: set it to {off}")
+    if not in_jax and config.agent_resets:
+        raise UserError(f"agent_resets = {config.agent_resets} needs a step in JAX, which {name} does not have: set it to ()")
 
 
 def steps_to_learn(env: Environment, config: TrainConfig) -> int:
-    """What is left of `config.steps` after the random steps at the start.
+    """What is left of `config.num_steps` after the random steps at the start.
 
     Raises:
       UserError: if nothing is.
     """
     at_random = warm_up_iterations(env, config) * config.steps_per_iteration if config.learns_from_rollouts else 0
-    if config.steps <= at_random:
-        raise UserError(f"steps = {config.steps} ends within the {at_random} random steps before learning: raise steps")
-    return config.steps - at_random
+    if config.num_steps <= at_random:
+        raise UserError(f"steps = {config.num_steps} ends within the {at_random} random steps before learning: raise steps")
+    return config.num_steps - at_random
 
 
 def check_seeds(seeds: Sequence[int]) -> None:

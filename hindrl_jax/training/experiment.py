@@ -23,7 +23,7 @@ from hindrl_jax.training.devices import gather, spread
 from hindrl_jax.training.host import HostPrograms
 from hindrl_jax.training.programs import FRESH_EPISODES, JaxPrograms, Programs
 from hindrl_jax.training.result import Result, Row
-from hindrl_jax.training.selection import choose, keep, nothing_kept
+from hindrl_jax.training.selection import Trial, better, choose, keep, nothing_kept
 
 Report = Callable[[Result], Any]
 
@@ -127,7 +127,7 @@ def _train(result: Result, programs: Programs, report: Report) -> None:
             result.state = jax.block_until_ready(programs.warm_start(result.state, result.guidance))
             result.updates = config.bc_warm_start
     ends = result.kept.all_confirmed
-    while result.steps_done < config.steps and not ends:
+    while result.steps_done < config.num_steps and not ends:
         result.state, metrics = programs.learn(result.state, result.guidance)
         result.chunks.append(gather(metrics))
         if config.learns_from_rollouts:
@@ -137,7 +137,7 @@ def _train(result: Result, programs: Programs, report: Report) -> None:
             result.updates += programs.chunk
         _check_finite(result)
         evaluations_done = len(result.rows) // len(result.seeds)
-        if result.steps_done >= min(programs.steps_at_random + (evaluations_done + 1) * config.eval_every, config.steps):
+        if result.steps_done >= min(programs.steps_at_random + (evaluations_done + 1) * config.eval_every, config.num_steps):
             _evaluate(result, programs, started)
         result.train_seconds = time.perf_counter() - started
         answer = report(result)
@@ -150,27 +150,37 @@ def _train(result: Result, programs: Programs, report: Report) -> None:
 
 def _evaluate(result: Result, programs: Programs, started: float) -> None:
     """Evaluates the present policies, notes it, and keeps those that are good."""
-    present, stop_at = policy(result.state.agent, average=True), result.config.stop_at
-    evaluation = _played(result, programs, present, result.config.eval_episodes)
-    result.train_seconds = time.perf_counter() - started
+    present, stop_at, num_episodes = policy(result.state.agent, average=True), result.config.stop_at, result.config.eval_episodes
+    noise: Any = np.zeros(len(result.seeds))
+    evaluation = by_mean = _played(result, programs, present, num_episodes)
     averaged = {name: np.mean([chunk[name] for chunk in result.chunks], axis=0) for name in result.chunks[0]} if result.chunks else {}
-    result.rows += _rows(result, evaluation, averaged)
+    if result.config.learns_from_rollouts:  # cloning leaves the deviation of the actions as it happens to be
+        sampled = _played(result, programs, _with_noise(present, np.ones_like(noise), programs), num_episodes)
+        averaged["evaluation/sampled_success"] = np.asarray(sampled.success).mean(axis=1)
+        noise, evaluation = better(by_mean, sampled)
+    result.train_seconds = time.perf_counter() - started
+    result.rows += _rows(result, by_mean, averaged)
     result.chunks.clear()
     confirmed = np.zeros(len(result.seeds), bool)
     if stop_at is not None:
         confirmed = (np.asarray(evaluation.success).mean(axis=1) >= stop_at) & (result.kept.confirmed < 0)
         if confirmed.any():
-            again = _played(result, programs, present, FRESH_EPISODES)
+            again = _played(result, programs, _with_noise(present, noise, programs), FRESH_EPISODES)
             confirmed &= np.asarray(again.success).mean(axis=1) >= stop_at
-    result.kept = keep(result.kept, gather(present.actor), evaluation, confirmed, result.moment)
+    result.kept = keep(result.kept, Trial(gather(present.actor), noise, evaluation), confirmed, result.moment)
+
+
+def _with_noise(policies: Policy, noise: np.ndarray, programs: Programs) -> Policy:
+    return policies.replace(noise=spread(noise.astype(np.float32), programs.mesh))
 
 
 def _finish(result: Result, programs: Programs) -> None:
     """Chooses the policies that are returned."""
     scale = result.state.agent.scale
 
-    def play(actor: Any) -> Evaluation:
-        return _played(result, programs, Policy(actor=spread(actor, programs.mesh), scale=scale), FRESH_EPISODES)
+    def play(actor: Any, noise: np.ndarray) -> Evaluation:
+        of_runs: dict[str, Any] = spread(dict(actor=actor, noise=noise.astype(np.float32)), programs.mesh)
+        return _played(result, programs, Policy(scale=scale, **of_runs), FRESH_EPISODES)
 
     result.returned, last = choose(result.kept, gather(result.state.agent.average_actor), result.moment, play)
     result.final_success, result.final_length = (np.asarray(outcome).mean(axis=1) for outcome in (last.success, last.length))

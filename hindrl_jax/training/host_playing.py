@@ -26,10 +26,10 @@ HostAct = Callable[[np.ndarray, np.ndarray], np.ndarray]
 class HostPolicies:
     """The policies of S seeds as one compiled program, for any number of environments each."""
 
-    def __init__(self, env: Environment, config: TrainConfig, mesh: Mesh, *, stochastic: bool):
-        def act(key: Array, actor: Policy, observation: Array, desired_goal: Array) -> tuple[Array, Array]:
+    def __init__(self, env: Environment, config: TrainConfig, mesh: Mesh):
+        def act(key: Array, policy: Policy, observation: Array, desired_goal: Array) -> tuple[Array, Array]:
             key, key_act = jax.random.split(key)
-            action = make_policy(actor, env, config, stochastic=stochastic)(key_act, observation, desired_goal)
+            action = make_policy(policy, env, config)(key_act, observation, desired_goal)
             return key, action_to_env(action, env)
 
         self._mesh, self._program = mesh, jax.jit(over_seeds(act, mesh))

@@ -105,8 +105,6 @@ class TrainedPolicies:
     """Leaves (S, ...)."""
     behavioural_goals: GoalTable
     """Leaves (S, ...)."""
-    stochastic: bool = False
-    """Sample the actions, instead of taking the mean ones."""
 
     @property
     def num_held(self) -> int:
@@ -140,7 +138,7 @@ class TrainedPolicies:
         """`player` of one policy. It aims at the first behavioural goal, or with `any_goal` at one drawn for the episode."""
         env = self.env
         policy, goals = jax.tree.map(lambda leaf: leaf[index], (self.policies, self.behavioural_goals))
-        choose = make_policy(policy, env, self.config, stochastic=self.stochastic)
+        choose = make_policy(policy, env, self.config)
 
         def act(key: Array, state: Any, observation: Array) -> Array:
             # The state's key is constant within an episode, and so is the goal drawn with it.
@@ -162,7 +160,7 @@ class TrainedPolicies:
         if not isinstance(self.env, Watchable):
             raise UserError(f"{self.env.name} does not draw itself: play it, and draw the states")
         policy, goals = jax.tree.map(lambda leaf: leaf[index : index + 1], (self.policies, self.behavioural_goals))
-        host_policies = host_playing.HostPolicies(self.env, self.config, seed_mesh(1), stochastic=self.stochastic)
+        host_policies = host_playing.HostPolicies(self.env, self.config, seed_mesh(1))
         first_goal, pictures, num_solved = np.asarray(goals.goals[0, :1]), [], 0
         for key in keys:
             key_seed, key_act = jax.random.split(key)
@@ -178,14 +176,14 @@ class TrainedPolicies:
 
         @jax.vmap
         def play_episodes(key: Array, policy: Policy, goals: GoalTable) -> Evaluation:
-            return rollout.evaluate(key, env, goals, make_policy(policy, env, self.config, stochastic=self.stochastic), num_episodes)
+            return rollout.evaluate(key, env, goals, make_policy(policy, env, self.config), num_episodes)
 
         program = jax.jit(play_episodes, compiler_options=compiler_options(env))
         return jax.device_get(program(keys, self.policies, self.behavioural_goals))
 
     def _evaluate_on_host(self, env: HostStepped, keys: Array, num_episodes: int) -> Evaluation:
         """Episodes of all policies side by side, up to `num_envs` for each."""
-        policies = host_playing.HostPolicies(env, self.config, seed_mesh(len(keys)), stochastic=self.stochastic)
+        policies = host_playing.HostPolicies(env, self.config, seed_mesh(len(keys)))
         with contextlib.closing(env.stepper(len(keys) * min(self.config.num_envs, num_episodes))) as stepper:
             with_goals = host_playing.with_goals_of(stepper, env, self.behavioural_goals)
             return host_playing.evaluate(keys, with_goals, policies, self.policies, num_episodes)

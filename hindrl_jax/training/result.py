@@ -44,12 +44,14 @@ class SeedSummary:
     """Share of 100 fresh episodes, others than those that chose it, that the returned policy solves: the best that the run has seen."""
     returned_length: float
     """Mean length of those episodes."""
+    returned_noise: float
+    """Of its actions: 0 where it plays the mean ones, 1 where it samples them, whichever was seen to solve more."""
     returned_env_steps: int
     """Environment steps after which the returned policy was seen."""
     returned_updates: int
     returned_seconds: float
     final_success: float
-    """Share of 100 fresh episodes that the last policy solves."""
+    """Share of 100 fresh episodes that the last policy solves with its mean actions."""
     best_success: float
     """The best evaluation, the final one included."""
     env_steps_to_95: int | None
@@ -151,6 +153,7 @@ class Result:
             seed=seed,
             returned_success=float(self.returned.success[index]),
             returned_length=float(self.returned.length[index]),
+            returned_noise=float(self.returned.noise[index]),
             returned_env_steps=int(self.returned.env_steps[index]),
             returned_updates=int(self.returned.updates[index]),
             returned_seconds=float(self.returned.seconds[index]),

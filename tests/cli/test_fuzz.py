@@ -230,7 +230,7 @@ FLAG = st.sampled_from(
         "env algo preset config resume demos seeds seed out overwrite no-overwrite steps num-envs num-objects horizon size buffer-size batch-size "
         "learning-rate gamma n-step bc-weight net-arch num-quantiles epsilon-steps epsilon-deviations eval-every checkpoint-every over episodes to "
         "directory options tasks "
-        "expert host num-hosts distributed coordinator epsilon-filtering strategy-mixture hindrl-sampling-strategy base backend num-waypoints"
+        "expert host num-hosts distributed coordinator epsilon-filtering hindrl-sampling-strategy base backend num-waypoints"
     )
 )
 ARGUMENT = st.one_of(WORD, FLAG.map("--{}".format), st.tuples(FLAG, WORD).map(lambda pair: f"--{pair[0]}={pair[1]}"))

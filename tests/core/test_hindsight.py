@@ -98,9 +98,7 @@ def test_a_source_draws_every_state_that_it_may_and_no_other(strategy):
     for (_, _, state, length), drawn, was_found in zip(places, observations, found, strict=True):
         allowed = allowed_goals(strategy, state, length, sources)
         assert set(triples(drawn[was_found])) == allowed
-        assert was_found.any() == bool(allowed)
-        always = allowed_goals("joint_intersection", state, length, sources) if strategy == "mixture" else allowed  # an intersection may be empty
-        assert was_found.all() == bool(always)
+        assert set(was_found.tolist()) == {bool(allowed)}  # an intersection may be empty
 
 
 @pytest.mark.parametrize("strategy", ["final", "future", "episode", "random", "task_conditioned", "joint_union"])

@@ -1,4 +1,4 @@
-"""The fast forms of truncation and quantile loss against plain ones, products in bfloat16, and batches in blocks."""
+"""The fast forms of truncation and quantile loss against plain ones, and batches in blocks."""
 
 import chex
 import hypothesis
@@ -9,7 +9,7 @@ import pytest
 from hypothesis import strategies as st
 
 from hindrl_jax.core import kernels
-from hindrl_jax.core.kernels import bfloat16_product, drop_largest, mean_over_blocks, num_blocks, quantile_huber, quantile_midpoints
+from hindrl_jax.core.kernels import drop_largest, mean_over_blocks, num_blocks, quantile_huber, quantile_midpoints
 
 
 def test_drop_largest_by_hand():
@@ -74,20 +74,6 @@ def test_both_forms_of_truncation_keep_the_same_atoms(form, num_dropped):
     np.testing.assert_array_equal(np.sort(form(jnp.asarray(atoms), num_dropped=num_dropped), axis=0), expected)
 
 
-def test_bfloat16_product_by_hand():
-    # Between 1 and 2, bfloat16 has steps of 1/128: 1 + 1/512 is 1 and 1 + 3/512 is 1 + 1/128. Sums keep what is smaller: 128 + 1/128.
-    kernel = jnp.array([[1.0 + 1 / 512], [1.0 + 3 / 512]])
-    features = jnp.array([[128.0, 0.0], [1 / 128, 1.0]])
-    product, backward = jax.vjp(bfloat16_product, kernel, features)
-    assert product.dtype == jnp.float32
-    np.testing.assert_array_equal(product, [[128.0 + (1 + 1 / 128) / 128, 1.0 + 1 / 128]])
-    # Backwards likewise, with cotangents 1 + 1/512 -> 1 and 2: by the kernel, features times cotangents; by the features, kernel times cotangents.
-    by_kernel, by_features = backward(jnp.array([[1.0 + 1 / 512, 2.0]]))
-    np.testing.assert_array_equal(by_kernel, [[128.0], [1 / 128 + 2.0]])
-    np.testing.assert_array_equal(by_features, [[1.0, 2.0], [1.0 + 1 / 128, 2.0 + 1 / 64]])
-    assert (by_kernel.dtype, by_features.dtype) == (jnp.float32, jnp.float32)
-
-
 def test_blocks_are_as_few_as_the_cache_allows_and_equal(monkeypatch):
     monkeypatch.setattr(kernels, "_BLOCK_BYTES", 1000)
     # 10 float32 numbers are 40 bytes per row: at most 25 rows per block.
@@ -105,13 +91,13 @@ def test_mean_over_blocks_is_the_mean_over_the_batch():
         reward=jnp.arange(12.0),
         discount=jnp.ones(12),
         is_demonstration=jnp.arange(12) < 5,
-        obtained_return=jnp.asarray(rng.uniform(size=12), jnp.float32),
-        weight=None,
+        weight=jnp.asarray(rng.uniform(size=12), jnp.float32),
+        nothing=None,
     )
 
     def function(block):
         # Columns stay together: a product of different fields would show a mixture.
-        product = block["inputs"][0] * block["action"][1] * block["reward"] * block["is_demonstration"] * block["obtained_return"]
+        product = block["inputs"][0] * block["action"][1] * block["reward"] * block["is_demonstration"] * block["weight"]
         return {"mean": jnp.mean(product), "matrix": block["inputs"] @ block["action"].T / block["reward"].shape[0]}
 
     expected = function(columns)

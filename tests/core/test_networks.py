@@ -1,6 +1,5 @@
 """Networks: shapes, the density of the squashed Gaussian, and an ensemble whose members differ."""
 
-import dataclasses
 import math
 
 import chex
@@ -108,24 +107,6 @@ def test_mean_return_is_the_mean_of_the_quantiles(critics):
         for f in (lambda critics, action: mean_return(critics, INPUTS, action, CONFIG), by_definition)
     )
     chex.assert_trees_all_close(given, expected, atol=1e-5)
-
-
-def test_bfloat16_networks_are_the_same_but_rounded(actor):
-    rounded = dataclasses.replace(CONFIG, network_precision="bfloat16")
-
-    def means(config, actor, inputs):
-        return apply_actor(actor, inputs, config, action_dim=ACTION_DIM).mean
-
-    plain, coarse = means(CONFIG, actor, INPUTS), means(rounded, actor, INPUTS)
-    assert coarse.dtype == jnp.float32
-    np.testing.assert_allclose(coarse, plain, atol=0.02)
-    assert np.abs(coarse - plain).max() > 0.0  # it does round
-    gradients = [
-        jax.grad(lambda actor, inputs, c=config: jnp.sum(jnp.square(means(c, actor, inputs))), argnums=(0, 1))(actor, INPUTS)
-        for config in (CONFIG, rounded)
-    ]
-    largest = max(float(jnp.abs(leaf).max()) for leaf in jax.tree.leaves(gradients[0]))
-    chex.assert_trees_all_close(gradients[1], gradients[0], atol=0.03 * largest)
 
 
 def numeric_log_density(action, mean, std):

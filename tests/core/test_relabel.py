@@ -111,7 +111,7 @@ GOALS = [4.0, 4.0, 4.0, 8.0, 9.0, 9.0]
     ],
 )
 def test_relabelling_by_hand(quirks, rewards, discounts, nexts):
-    batch_config = BatchConfig(relabelled_per_original=2, hindrl_sampling_strategy="final", n_step=2, gamma=0.5, bound_by_obtained_return=True)
+    batch_config = BatchConfig(relabelled_per_original=2, hindrl_sampling_strategy="final", n_step=2, gamma=0.5)
     config, replay = TrainConfig(batch=batch_config, quirks=quirks), replay_of_both()
     row, step = (jnp.array(column) for column in zip(*ROWS, strict=True))
     chosen = jnp.arange(6) < num_relabelled(jnp.asarray(6), batch_config.relabelled_per_original)
@@ -124,8 +124,6 @@ def test_relabelling_by_hand(quirks, rewards, discounts, nexts):
     assert batch.discount.tolist() == discounts
     assert batch.next_observation[:, 0].tolist() == nexts
     assert batch.observation[:, 0].tolist() == [0.0, 1.0, 2.0, 5.0, 5.0, 0.0]  # what was observed stays
-    # The episode's last reward says nothing of a relabelled goal; row 4 is one step before it: 1 * 1/2.
-    assert batch.obtained_return.tolist() == [0.0, 0.0, 0.0, 0.0, 0.5, 0.0]
 
 
 def test_a_source_is_asked_for_the_rows_steps_and_where_it_finds_nothing_the_row_stays():
@@ -149,10 +147,9 @@ def test_a_source_is_asked_for_the_rows_steps_and_where_it_finds_nothing_the_row
     assert steps.is_relabelled.tolist() == [True, False, True, False, False]
     assert steps.desired_goal[:, 0].tolist() == [2.0, 9.0, 7.0, 9.0, 9.0]
     assert steps.ends.tolist() == [[True, False], [False, False], [True, False], [False, False], [False, False]]
-    assert steps.has_recorded_rewards.tolist() == [False, True, False, True, True]
     counted = np.where(steps.inside, steps.rewards, 0.0)
     assert counted.tolist() == [[1.0, 0.0], [0.0, 0.0], [1.0, 0.0], [1.0, 0.0], [0.0, 0.0]]
-    for name in ("row", "step", "observation", "action", "next_observations", "inside", "is_last", "terminated", "steps_left", "last_reward"):
+    for name in ("row", "step", "observation", "action", "next_observations", "inside", "is_last", "terminated"):
         np.testing.assert_array_equal(getattr(steps, name), getattr(recorded, name))
 
 
@@ -176,7 +173,6 @@ def test_chosen_rows_are_rewarded_for_their_own_goal_by_hand(quirks, ends):
     steps = reward_by_goal(steps, jnp.array([True, False, True]), goal_test(quirks))
     assert steps.rewards.tolist() == [[0.0, 1.0], [0.0, 1.0], [0.0, 0.0]]
     assert steps.ends.tolist() == [[False, ends], [False, False], [False, False]]
-    assert steps.has_recorded_rewards.tolist() == [False, True, False]
     assert steps.desired_goal[:, 0].tolist() == [9.0] * 3
     assert steps.is_relabelled.tolist() == [False] * 3
 
@@ -212,7 +208,7 @@ def test_relabelled_observations_by_hand(quirks):
     #   row 2, episode 1 from step 1 on: (8, 8) reaches it: 1, and the return ends
     #   row 3, the same, original: its recorded reward of 1 at (8, 9), where it was solved
     replay = replay_with_targets()
-    batch_config = BatchConfig(relabelled_per_original=1, hindrl_sampling_strategy="final", n_step=2, gamma=0.5, bound_by_obtained_return=True)
+    batch_config = BatchConfig(relabelled_per_original=1, hindrl_sampling_strategy="final", n_step=2, gamma=0.5)
     config, env = TrainConfig(batch=batch_config, quirks=quirks), LineWithTarget()
     steps = read_steps(replay.episodes, jnp.array([0, 0, 1, 1]), jnp.array([0, 1, 1, 1]), 2)
     chosen = jnp.array([True, True, True, False])
@@ -222,7 +218,6 @@ def test_relabelled_observations_by_hand(quirks):
     assert batch.next_observation.tolist() == [[2.0, 4.0], [4.0, 4.0], [8.0, 8.0], [8.0, 9.0]]
     assert batch.reward.tolist() == [0.0, 0.5, 1.0, 1.0]
     assert batch.discount.tolist() == [0.25, 0.0, 0.0, 0.0]
-    assert batch.obtained_return.tolist() == [0.0, 0.0, 0.0, 1.0]
     assert batch.is_relabelled.tolist() == [True, True, True, False]
     assert batch.desired_goal[:, 0].tolist() == [9.0] * 4  # goals stay
 

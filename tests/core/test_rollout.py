@@ -46,18 +46,6 @@ def test_episodes_end_where_they_should(played):
         assert np.asarray(time_steps.reward[:, env]).tolist() == (ends & solves).tolist()
 
 
-def test_episodes_are_cut_where_they_should_be_unless_the_step_solves_them():
-    key, key_anew = jax.random.split(jax.random.key(1))
-    state, anew = (rollout.reset(k, ENV, GOALS, 3) for k in (key, key_anew))
-    state, _ = rollout.step(state, anew, ACTIONS, ENV, cut=jnp.zeros(3, bool))
-    after, time_step = rollout.step(state, anew, ACTIONS, ENV, cut=jnp.array([True, True, False]))
-    assert time_step.terminated.tolist() == [True, False, False]  # the first is solved in two steps
-    assert time_step.truncated.tolist() == [False, True, False]
-    np.testing.assert_array_equal(time_step.observation[:, 1], [2.0, 2.0, 2.0])
-    np.testing.assert_array_equal(after.observation[:2], anew.observation[:2])
-    np.testing.assert_array_equal(after.observation[2], time_step.observation[2])
-
-
 def test_auto_reset_keeps_the_true_next_observation_and_starts_a_fresh_episode(played):
     start, states, time_steps = played
     before = np.concatenate([start.observation[None], states.observation[:-1]])

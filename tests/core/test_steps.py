@@ -28,7 +28,6 @@ def test_two_step_returns_by_hand(terminated, quirks, discounts):
     #   from step 0: 1 + 2/2 = 2, up to state 12; not at the end, so the value of state 12 counts with gamma^2 = 1/4
     #   from step 1: 2 + 4/2 = 4, up to state 13, where the episode ends
     #   from step 2: 4, up to state 13; there is no second step
-    # The episode goes on to obtain its last reward, 4, which is worth 4/4, 4/2 and 4 at steps 0, 1 and 2.
     episodes = Episodes(
         observations=jnp.array([[[10.0], [11.0], [12.0], [13.0], [jnp.nan]]]),
         actions=jnp.array([[[0.1], [0.2], [0.3], [jnp.nan]]]),
@@ -37,12 +36,11 @@ def test_two_step_returns_by_hand(terminated, quirks, discounts):
         terminated=jnp.array([terminated]),
         desired_goals=jnp.array([[-7.0]]),
     )
-    config = TrainConfig(batch=BatchConfig(gamma=0.5, n_step=2, bound_by_obtained_return=True), quirks=quirks)
+    config = TrainConfig(batch=BatchConfig(gamma=0.5, n_step=2), quirks=quirks)
     steps = read_steps(episodes, jnp.zeros(3, jnp.int32), jnp.arange(3), 2)
     batch = transitions(steps, lambda observation: 100.0 * observation, config, is_demonstration=True)
     assert batch.reward.tolist() == [2.0, 4.0, 4.0]
     assert batch.discount.tolist() == discounts
-    assert batch.obtained_return.tolist() == [1.0, 2.0, 4.0]
     assert batch.observation.tolist() == [[10.0], [11.0], [12.0]]
     assert batch.next_observation.tolist() == [[12.0], [13.0], [13.0]]
     assert batch.achieved_goal.tolist() == [[1000.0], [1100.0], [1200.0]]
@@ -85,7 +83,6 @@ ROWS = 6
             BatchConfig,
             n_step=st.sampled_from([1, 3]),
             gamma=st.sampled_from([0.5, 0.9, 1.0]),
-            bound_by_obtained_return=st.booleans(),
         ),
         quirks=st.builds(
             QuirksConfig,
@@ -136,11 +133,6 @@ def test_transitions_are_those_of_a_plain_loop(lengths, places, terminated, rows
         np.testing.assert_array_equal(batch.observation[i], observations[row[i], first[i]])
         np.testing.assert_array_equal(batch.achieved_goal[i], observations[row[i], first[i], 2:])
         assert batch.action[i, 0] == -rewards[row[i], first[i]]
-        if config.batch.bound_by_obtained_return:
-            last = lengths[row[i]] - 1
-            obtained = 0.0 if by_goal[i] else rewards[row[i], last] * config.batch.gamma ** (last - first[i])
-            np.testing.assert_allclose(batch.obtained_return[i], obtained, rtol=1e-5)
-    assert (batch.obtained_return is None) == (not config.batch.bound_by_obtained_return)
     assert batch.is_demonstration.tolist() == [is_demonstration] * ROWS
     assert batch.is_relabelled.tolist() == by_goal.tolist()
 

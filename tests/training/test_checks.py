@@ -23,7 +23,7 @@ def demonstrations():
     [
         ([CONFIG], "1 configs for 2 seeds"),
         ([CONFIG, dataclasses.replace(CONFIG, num_envs=4)], "may differ only in union_sampling_ratio, gamma"),
-        ([CONFIG, with_values(CONFIG, {"final_learning_rate": 1e-3})], "final_learning_rate is None in some"),
+        ([CONFIG, with_values(CONFIG, {"final_target_entropy": -4.0})], "final_target_entropy is None in some"),
     ],
 )
 def test_configs_that_need_programs_of_their_own_are_refused(configs, message, demonstrations):

@@ -43,15 +43,12 @@ OTHER_VALUES = dict(
     gamma=0.7,
     epsilon_deviations=2.0,
     learning_rate=3e-3,
-    final_learning_rate=1e-3,
     target_update_rate=0.2,
-    actor_average_rate=0.5,
     actor_average_span=3.0,
     initial_alpha=0.1,
     target_entropy=-2.0,
     final_target_entropy=-4.0,
     bc_weight=0.5,
-    final_bc_weight=0.2,
 )
 
 
@@ -62,7 +59,7 @@ def test_configs_that_differ_in_numbers_share_one_program(demonstrations):
         CONFIG,
         batch=dataclasses.replace(CONFIG.batch, hindrl_sampling_strategy="joint_union", relabelled_per_original=1.0),
         goal=GoalConfig(epsilon_steps=2),
-        agent=dataclasses.replace(CONFIG.agent, final_learning_rate=1e-4, final_bc_weight=0.01, target_entropy=-1.0, final_target_entropy=-10.0),
+        agent=dataclasses.replace(CONFIG.agent, target_entropy=-1.0, final_target_entropy=-10.0),
     )
     other = with_values(config, OTHER_VALUES)
     assert all(sweepable_value(config, name) != sweepable_value(other, name) for name in SWEEPABLE)

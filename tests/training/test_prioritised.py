@@ -265,20 +265,12 @@ def test_the_config_says_how_batches_are_drawn():
     chex.assert_trees_all_equal(sampler_for(env, PRIORITISED).init(data, replay), prioritised.init(demonstrations(), replay.episodes, CONFIG))
 
 
-MIXTURE = BatchConfig(
-    batch_size=16,
-    n_step=2,
-    hindrl_sampling_strategy="mixture",
-    strategy_mixture=(("future", 1.0), ("task_conditioned", 1.0), ("joint_intersection", 1.0)),
-    bound_by_obtained_return=True,
-)
-
-
 def test_prioritised_training_over_two_seeds():
     """With everything else that a batch can have. The priorities are finite, where they should be, no longer those of the start, and in place."""
     env, goal = make_env(), GoalConfig(epsilon_steps=1, epsilon_deviations=1.0)
     agent = dataclasses.replace(make_config().agent, num_critics=3, num_target_critics=2, clip_targets=True)
-    config = make_config(batch=MIXTURE, goal=goal, agent=agent, priority=PriorityConfig(priority_exponent=0.5, demo_priority_bonus=3.0))
+    batch = BatchConfig(batch_size=16, n_step=2, hindrl_sampling_strategy="joint_intersection")
+    config = make_config(batch=batch, goal=goal, agent=agent, priority=PriorityConfig(priority_exponent=0.5, demo_priority_bonus=3.0))
     data, sampler = make_data(config), prioritised_sampler(env, config)
 
     @jax.jit
