@@ -66,8 +66,10 @@ class AgentConfig:
     """Weight of the behaviour cloning loss on demonstration rows (lambda_BC of the thesis)."""
     final_bc_weight: float | None = None
     """Where that weight has moved, linearly, by the end of the run; None keeps it constant."""
-    q_filter: bool = False
-    """Clone only the demonstrated actions that the critics value above the policy's own (Nair et al., 2018, eq. 4)."""
+    q_filter: Literal["off", "hard", "smooth"] = "off"
+    """Clone only the demonstrated actions that the critics value above the policy's own (hard; Nair et al., 2018, eq. 4), or each in proportion to
+    the probability that it is better (smooth; SPReD, Zhu et al., 2025), where the critics' values, tqc's the means of their quantiles, are an
+    ensemble."""
     input_encoding: Literal["raw", "multiscale", "standardised"] = "multiscale"
     """Networks see inputs as they are (thesis); or less their mean in the demonstrations, over their standard deviation; or (multiscale) that and
     tanh(4 x), x being the input over its root mean square there."""
@@ -100,6 +102,8 @@ class AgentConfig:
             bc_weight=(self.bc_weight >= 0.0, "0 or more"),
             final_bc_weight=(self.final_bc_weight is None or self.final_bc_weight >= 0.0, "0 or more, or None"),
         )
+        if self.q_filter == "smooth" and self.num_critics < 2:
+            raise ValueError("q_filter = smooth compares the critics' values with each other, but num_critics = 1: raise it, or choose hard")
         if self.base == "ddpg" and self.num_critics > 1:
             raise ValueError(f"ddpg has one critic, but num_critics = {self.num_critics}: set it to 1, or choose td3")
 

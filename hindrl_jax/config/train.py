@@ -87,7 +87,7 @@ class TrainConfig:
         if self.demo_reset_curriculum > 0.0 and self.demo_reset_ratio == 0.0:
             raise ValueError(f"demo_reset_curriculum = {self.demo_reset_curriculum} is of no use while demo_reset_ratio = 0: raise that, too")
         if self.algo == "bc":
-            given: dict[str, Any] = {"bc_warm_start": self.bc_warm_start, "q_filter": self.agent.q_filter}
+            given: dict[str, Any] = {"bc_warm_start": self.bc_warm_start, "q_filter": self.agent.q_filter != "off" and self.agent.q_filter}
             given |= {"priority_exponent": self.priority.priority_exponent, "base": self.agent.base != "tqc" and self.agent.base}
             for name, value in given.items():
                 if value:

@@ -22,8 +22,16 @@ from hindrl_jax.base.types import Array, Transition, tree_where
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.core.inputs import InputScale, network_inputs
 from hindrl_jax.core.kernels import mean_over_blocks, num_blocks
-from hindrl_jax.core.losses import behaviour_cloning, entropy_coefficient, quantile_huber, squared_error, target_atoms, target_value
-from hindrl_jax.core.networks import Params, apply_actor, apply_critics, init_actor, init_critics, mean_return
+from hindrl_jax.core.losses import (
+    behaviour_cloning,
+    entropy_coefficient,
+    probability_of_being_better,
+    quantile_huber,
+    squared_error,
+    target_atoms,
+    target_value,
+)
+from hindrl_jax.core.networks import Params, apply_actor, apply_critics, init_actor, init_critics, mean_return, mean_returns
 from hindrl_jax.core.schedules import Schedule
 
 Metrics = dict[str, Array]
@@ -234,6 +242,18 @@ def _value(critics: Params, inputs: Array, action: Array, config: TrainConfig) -
     return apply_critics(jax.tree.map(lambda leaf: leaf[:1], critics), inputs, action, config.agent)[0, 0]
 
 
+def _cloning_weight(critics: Params, block: _Columns, own_action: Array, config: TrainConfig) -> Array:
+    """How much of each column is cloned, (B,) in [0, 1]: of demonstrations, what the Q-filter passes."""
+    own_action = jax.lax.stop_gradient(own_action)
+    if config.agent.q_filter == "hard":
+        valued = _value(critics, block.inputs, block.action, config) > _value(critics, block.inputs, own_action, config)
+        return block.is_demonstration & valued
+    if config.agent.q_filter == "smooth":
+        values, own_values = (mean_returns(critics, block.inputs, action, config.agent) for action in (block.action, own_action))
+        return block.is_demonstration * probability_of_being_better(values, own_values)
+    return block.is_demonstration
+
+
 def _actor_gradient(state: AgentState, schedule: Schedule, config: TrainConfig, block: _Columns) -> tuple[Params, Metrics]:
     """The gradient of the actor's loss over a block, and metrics."""
     agent, quirks = config.agent, config.quirks
@@ -245,11 +265,8 @@ def _actor_gradient(state: AgentState, schedule: Schedule, config: TrainConfig, 
             action, log_prob = distribution.mode, jnp.zeros(block.reward.shape)
         values = _value(state.critics, block.inputs, action, config)
         value, entropy = jnp.mean(values), -jnp.mean(log_prob)
-        clonable = block.is_demonstration
-        if agent.q_filter:
-            own = _value(state.critics, block.inputs, jax.lax.stop_gradient(distribution.mode), config)
-            clonable &= _value(state.critics, block.inputs, block.action, config) > own
-        bc = behaviour_cloning(distribution.mode if quirks.bc_action == "mean" else action, block.action, clonable, form=quirks.bc_loss)
+        weight = _cloning_weight(state.critics, block, distribution.mode, config)
+        bc = behaviour_cloning(distribution.mode if quirks.bc_action == "mean" else action, block.action, weight, form=quirks.bc_loss)
         climbed = jnp.mean(values / jax.lax.stop_gradient(jnp.maximum(values, _LEAST_VALUE))) if agent.relative_value else value
         total = -jnp.exp(state.log_alpha) * entropy - climbed + schedule.bc_weight * bc
         if agent.preactivation_weight > 0.0:

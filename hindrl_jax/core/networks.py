@@ -123,8 +123,13 @@ def apply_critics(params: Params, inputs: Array, action: Array, config: AgentCon
 
 
 def mean_return(params: Params, inputs: Array, action: Array, config: AgentConfig) -> Array:
-    """Mean over critics and quantiles of `apply_critics`, (B,), in less work: the last layer is linear, so its kernel is averaged instead."""
+    """Mean over critics and quantiles of `apply_critics`: (B,)."""
+    return jnp.mean(mean_returns(params, inputs, action, config), axis=0)
+
+
+def mean_returns(params: Params, inputs: Array, action: Array, config: AgentConfig) -> Array:
+    """Mean over the quantiles of `apply_critics`, (C, B), in less work: the last layer is linear, so its kernel is averaged instead."""
     last = f"Dense_{len(config.net_arch)}"
     output = jax.tree.map(lambda leaf: jnp.mean(leaf, axis=-1, keepdims=True), params["params"][last])
     averaged = {"params": {**params["params"], last: output}}
-    return jnp.mean(_apply_each(averaged, inputs, action, config, 1), axis=(0, 1))
+    return _apply_each(averaged, inputs, action, config, 1)[:, 0]

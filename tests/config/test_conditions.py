@@ -103,7 +103,7 @@ VALUES = {
     "preactivation_weight": (0.1, 0.2),
     "bc_weight": (0.1, 0.2),
     "final_bc_weight": (0.3, 0.4),
-    "q_filter": (True, False),
+    "q_filter": ("hard", "smooth"),
     "input_encoding": ("raw", "multiscale"),
     "priority_exponent": (0.5, 0.6),
     "importance_exponent": (0.6, 0.7),

@@ -110,7 +110,7 @@ BAD = [
     (AgentConfig, "relative_value", [1]),
     (AgentConfig, "preactivation_weight", [-0.1, None]),
     (AgentConfig, "final_bc_weight", [-1.0, float("nan")]),
-    (AgentConfig, "q_filter", ["yes"]),
+    (AgentConfig, "q_filter", [True, "yes"]),
     (AgentConfig, "num_quantiles", [0]),
     (AgentConfig, "top_quantiles_to_drop_per_net", [-1, AgentConfig().num_quantiles]),
     (AgentConfig, "target_update_rate", [0.0, 1.1]),
@@ -210,7 +210,7 @@ def test_the_algorithm_must_fit_its_settings(fitting, contradiction, name):
     "changes",
     [
         dict(bc_warm_start=1),
-        dict(agent=AgentConfig(q_filter=True)),
+        dict(agent=AgentConfig(q_filter="hard")),
         dict(agent=AgentConfig(base="sac")),
         dict(priority=PriorityConfig(priority_exponent=0.5)),
     ],

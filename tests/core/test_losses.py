@@ -5,7 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hindrl_jax.core.losses import behaviour_cloning, entropy_coefficient, quantile_huber, squared_error, target_atoms, target_value
+from hindrl_jax.core.losses import (
+    behaviour_cloning,
+    entropy_coefficient,
+    probability_of_being_better,
+    quantile_huber,
+    squared_error,
+    target_atoms,
+    target_value,
+)
 
 
 @pytest.mark.parametrize(
@@ -95,6 +103,36 @@ def test_behaviour_cloning_by_hand(form, expected):
     # d|x|^2 = 2x and d|x| = x / |x|, divided by four; finite at distance 0.
     first = [6.0 / 4, 8.0 / 4] if form == "squared" else [0.6 / 4, 0.8 / 4]
     np.testing.assert_allclose(gradient.T, [first, [0.0, 0.5 if form == "squared" else 0.25], [0.0, 0.0], [0.0, 0.0]], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("form", "expected"),
+    # Squared distances 25, 1 and 9 with weights 0.5, 1 and 0, divided by three rows; demonstrated lengths 4, 1 and 100: (0.5 * 4 + 1) / 1.5 = 2.
+    [("squared", 13.5 / 3), ("norm", (0.5 * 5.0 + 1.0) / 3), ("relative", 13.5 / 3 / 2.0)],
+)
+def test_weighted_behaviour_cloning_by_hand(form, expected):
+    demonstrated = jnp.array([[2.0, 1.0, 10.0]])
+    value = behaviour_cloning(demonstrated + jnp.array([[5.0, -1.0, 3.0]]), demonstrated, jnp.array([0.5, 1.0, 0.0]), form=form)
+    np.testing.assert_allclose(value, expected, rtol=1e-5)
+
+
+def test_small_weights_stay_small():
+    """Their sum is far below 1, and the mean length of what they weigh is still that of the actions: 0.001 * 1 / (2 rows * 4)."""
+    value = behaviour_cloning(jnp.array([[3.0, 3.0]]), jnp.array([[2.0, 9.0]]), jnp.array([1e-3, 0.0]), form="relative")
+    np.testing.assert_allclose(value, 1e-3 / 8, rtol=1e-5)
+    assert not behaviour_cloning(jnp.ones((1, 2)), jnp.zeros((1, 2)), jnp.zeros(2, bool), form="relative")
+
+
+def test_probability_of_being_better_by_hand():
+    # Column 0: means 2 and 0.5, variances 1 and 0.25: Phi(1.5 / sqrt(1.25) = 1.3416) = 0.91014. Column 1: the other way round. Column 2: equal means.
+    # Column 3: certain, and worse by 1.
+    values = jnp.array([[1.0, 0.0, 2.0, 3.0], [3.0, 1.0, 4.0, 3.0]])
+    others = jnp.array([[0.0, 1.0, 3.0, 4.0], [1.0, 3.0, 3.0, 4.0]])
+    np.testing.assert_allclose(probability_of_being_better(values, others), [0.91014, 0.08986, 0.5, 0.0], atol=1e-4)
+    # Three critics, of whom one disagrees: means 1 and 0, variances 2 and 0: Phi(1 / sqrt(2) = 0.7071) = 0.76025.
+    np.testing.assert_allclose(probability_of_being_better(jnp.array([[0.0], [0.0], [3.0]]), jnp.zeros((3, 1))), [0.76025], atol=1e-4)
+    for gradient in jax.grad(lambda *given: probability_of_being_better(*given).sum(), argnums=(0, 1))(values, others):
+        assert not gradient.any()
 
 
 @pytest.mark.parametrize(
