@@ -7,6 +7,9 @@ from typing import Literal
 
 from hindrl_jax.base.checks import check, check_types
 
+RESIDUAL_EXPANSION = 4
+"""Width inside a residual block, over that of the block."""
+
 
 @dataclasses.dataclass(frozen=True)
 class AgentConfig:
@@ -19,7 +22,10 @@ class AgentConfig:
     net_arch: tuple[int, ...] = (64, 64, 64, 64)
     """Widths of the hidden layers, the same for actor and critics."""
     layer_norm: bool = True
-    """Layer normalisation before each activation of the critics."""
+    """Layer normalisation before each activation of the critics; residual networks have their own."""
+    residual: bool = False
+    """Residual networks, actor and critics (SimBa; Lee et al., 2024): an embedding, then for each of the widths, which must be equal, a block
+    x + W2 relu(W1 LN(x)) that is four times as wide inside, then layer normalisation."""
     network_precision: Literal["float32", "bfloat16"] = "float32"
     """Operands of the networks' products: float32 (on NVIDIA GPUs TF32, as JAX has it), or bfloat16 summed in float32: faster, less steady."""
     learning_rate: float = 1e-3
@@ -102,6 +108,8 @@ class AgentConfig:
             bc_weight=(self.bc_weight >= 0.0, "0 or more"),
             final_bc_weight=(self.final_bc_weight is None or self.final_bc_weight >= 0.0, "0 or more, or None"),
         )
+        if self.residual and len(set(self.net_arch)) > 1:
+            raise ValueError(f"residual adds up layers of equal widths, but net_arch = {self.net_arch}: give equal ones, or turn residual off")
         if self.q_filter == "smooth" and self.num_critics < 2:
             raise ValueError("q_filter = smooth compares the critics' values with each other, but num_critics = 1: raise it, or choose hard")
         if self.base == "ddpg" and self.num_critics > 1:
@@ -111,6 +119,11 @@ class AgentConfig:
     def has_entropy(self) -> bool:
         """Whether the policy is random and rewarded for it; td3 and ddpg have a deterministic one."""
         return self.base in ("tqc", "sac")
+
+    @property
+    def widest_layer(self) -> int:
+        """Units of the widest hidden layer."""
+        return max(self.net_arch) * (RESIDUAL_EXPANSION if self.residual else 1)
 
     @property
     def critic_outputs(self) -> int:

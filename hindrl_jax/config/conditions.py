@@ -45,6 +45,7 @@ CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
         "{base} has no entropy coefficient: choose --base tqc or sac",
     ),
     ("num_quantiles top_quantiles_to_drop_per_net", lambda c: c.agent.base == "tqc", "{base} has no quantiles: choose --base tqc"),
+    ("layer_norm", lambda c: not c.agent.residual, "residual networks have layer normalisation of their own: set --no-residual"),
     ("exploration_noise", lambda c: not c.agent.has_entropy, "{base} samples its actions: choose --base td3 or ddpg"),
     ("target_noise target_noise_clip", lambda c: c.agent.base == "td3", "{base} has no such noise: choose --base td3"),
     (

@@ -30,6 +30,9 @@ class TrainConfig:
     action_hold: int | None = None
     """Control steps for which each action is held: one decision of the policy. Steps, horizon and episode lengths count control steps; epsilon_steps,
     n_step and gamma count decisions. None lets `fit` choose: as many as leave the median demonstration at least 60 decisions."""
+    action_chunks: bool = False
+    """Each decision is as many different actions in place of one that is held, played one after the other, and the critics value all of them together
+    (Q-chunking; Li, Zhou and Levine, 2025). action_hold says how many."""
     updates_per_iteration: int | None = None
     """Gradient steps after each decision of all environments; None takes one for every 4 control steps."""
     learning_starts: int = 0
@@ -86,6 +89,8 @@ class TrainConfig:
         )
         if self.demo_reset_curriculum > 0.0 and self.demo_reset_ratio == 0.0:
             raise ValueError(f"demo_reset_curriculum = {self.demo_reset_curriculum} is of no use while demo_reset_ratio = 0: raise that, too")
+        if self.action_chunks and self.action_hold == 1:
+            raise ValueError("action_chunks = True is of no use while action_hold = 1: raise that, too, or set it to None")
         if self.algo == "bc":
             given: dict[str, Any] = {"bc_warm_start": self.bc_warm_start, "q_filter": self.agent.q_filter != "off" and self.agent.q_filter}
             given |= {"priority_exponent": self.priority.priority_exponent, "base": self.agent.base != "tqc" and self.agent.base}

@@ -138,7 +138,7 @@ def update(key: Array, state: AgentState, batch: Transition, schedule: Schedule,
     Returns:
       The new agent and scalar metrics.
     """
-    blocks = num_blocks(batch.action.shape[0], max(config.agent.net_arch))
+    blocks = num_blocks(batch.action.shape[0], config.agent.widest_layer)
     columns, target_critics = _prepare(key, state, batch, config)
     gradient, critic_metrics = mean_over_blocks(functools.partial(_critic_gradient, state, target_critics, config), columns, blocks)
     critics, critic_optimiser = _descend(gradient, state.critic_optimiser, state.critics, schedule.learning_rate)

@@ -80,14 +80,12 @@ def squared_error(values: Array, target: Array) -> Array:
     return 0.5 * jnp.square(values - jax.lax.stop_gradient(target).reshape((1,) * (values.ndim - 1) + target.shape))
 
 
-def behaviour_cloning(
-    policy_action: Array, demonstrated_action: Array, weight: Array, *, form: Literal["relative", "squared", "norm"]
-) -> Array:
+def behaviour_cloning(policy_action: Array, demonstrated_action: Array, weight: Array, *, form: Literal["relative", "squared", "norm"]) -> Array:
     """Behaviour cloning loss: masked by "is a demonstration row", divided by the whole batch (thesis eq. 2.32).
 
     Args:
       policy_action, demonstrated_action: (A, B) in [-1, 1].
-      weight: (B,) in [0, 1], how much of each row is cloned: the mask delta^e; of its rows, with a Q-filter, those that pass it, or as far as they do.
+      weight: (B,) in [0, 1], how much of each row is cloned: the mask delta^e; with a Q-filter, those that pass it, or as far as they do.
       form: "squared" for the squared distance (thesis text), "norm" for the distance itself (original code), "relative" for the squared distance
         over the mean squared length of the demonstrated actions, weighted alike: 1 for a policy that does nothing.
 

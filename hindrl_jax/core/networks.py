@@ -14,7 +14,7 @@ from flax import linen as nn
 from flax import struct
 
 from hindrl_jax.base.types import Array
-from hindrl_jax.config import AgentConfig
+from hindrl_jax.config import RESIDUAL_EXPANSION, AgentConfig
 from hindrl_jax.core.kernels import bfloat16_product
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
@@ -50,9 +50,33 @@ class MLP(nn.Module):
         for width in self.net_arch:
             features = Dense(width, self.bfloat16)(features)
             if self.layer_norm:
-                features = nn.LayerNorm(reduction_axes=0, feature_axes=0)(features)
+                features = _layer_norm()(features)
             features = nn.relu(features)
         return Dense(self.out_dim, self.bfloat16)(features)
+
+
+class ResidualMLP(nn.Module):
+    """Residual network of SimBa (Lee et al., 2024): (in, B) -> (out_dim, B).
+
+    An embedding, then a block x + W2 relu(W1 LN(x)) for each entry of `net_arch`, four times as wide inside, then layer normalisation. Difference
+    from the paper: inputs are scaled by the demonstrations (`inputs`), not by running statistics.
+    """
+
+    net_arch: tuple[int, ...]
+    out_dim: int
+    bfloat16: bool = False
+
+    @nn.compact
+    def __call__(self, features: Array) -> Array:
+        features = Dense(self.net_arch[0], self.bfloat16)(features)
+        for width in self.net_arch:
+            inner = nn.relu(Dense(RESIDUAL_EXPANSION * width, self.bfloat16)(_layer_norm()(features)))
+            features = features + Dense(width, self.bfloat16)(inner)
+        return Dense(self.out_dim, self.bfloat16)(_layer_norm()(features))
+
+
+def _layer_norm() -> nn.LayerNorm:
+    return nn.LayerNorm(reduction_axes=0, feature_axes=0)
 
 
 class ActionDistribution(struct.PyTreeNode, kw_only=True):
@@ -79,12 +103,19 @@ class ActionDistribution(struct.PyTreeNode, kw_only=True):
         return jnp.tanh(pre_tanh), jnp.sum(log_prob - log_slope, axis=0)
 
 
-def _actor(config: AgentConfig, action_dim: int) -> MLP:
-    return MLP(net_arch=config.net_arch, out_dim=2 * action_dim, bfloat16=config.network_precision == "bfloat16")
+def _actor(config: AgentConfig, action_dim: int) -> nn.Module:
+    return _network(config, 2 * action_dim, layer_norm=False)
 
 
-def _critic(config: AgentConfig, out_dim: int) -> MLP:
-    return MLP(net_arch=config.net_arch, out_dim=out_dim, layer_norm=config.layer_norm, bfloat16=config.network_precision == "bfloat16")
+def _critic(config: AgentConfig, out_dim: int) -> nn.Module:
+    return _network(config, out_dim, layer_norm=config.layer_norm)
+
+
+def _network(config: AgentConfig, out_dim: int, *, layer_norm: bool) -> nn.Module:
+    bfloat16 = config.network_precision == "bfloat16"
+    if config.residual:
+        return ResidualMLP(net_arch=config.net_arch, out_dim=out_dim, bfloat16=bfloat16)
+    return MLP(net_arch=config.net_arch, out_dim=out_dim, layer_norm=layer_norm, bfloat16=bfloat16)
 
 
 def init_actor(key: Array, config: AgentConfig, *, input_dim: int, action_dim: int) -> Params:
@@ -129,7 +160,8 @@ def mean_return(params: Params, inputs: Array, action: Array, config: AgentConfi
 
 def mean_returns(params: Params, inputs: Array, action: Array, config: AgentConfig) -> Array:
     """Mean over the quantiles of `apply_critics`, (C, B), in less work: the last layer is linear, so its kernel is averaged instead."""
-    last = f"Dense_{len(config.net_arch)}"
+    num_hidden = 2 * len(config.net_arch) + 1 if config.residual else len(config.net_arch)
+    last = f"Dense_{num_hidden}"
     output = jax.tree.map(lambda leaf: jnp.mean(leaf, axis=-1, keepdims=True), params["params"][last])
     averaged = {"params": {**params["params"], last: output}}
     return _apply_each(averaged, inputs, action, config, 1)[:, 0]

@@ -169,6 +169,7 @@ OPTIONS: tuple[Option, ...] = (
         (("demo_reset_ratio", 0.5), ("demo_reset_curriculum", 0.5)),
     ),
     Option("layer-norm", "critic", "layer normalisation in the critics (RLPD)", (("agent.layer_norm", True),)),
+    Option("residual", "critic", "residual blocks of width 64, four of them, in critics and actor (SimBa)", (("agent.residual", True),)),
     Option("critics-1", "critic", "1 critic in place of 2", (("agent.num_critics", 1),)),
     Option("critics-5", "critic", "5 critics in place of 2 (TQC)", (("agent.num_critics", 5),)),
     Option("redq", "critic", "5 critics, of which 2 at random make the targets (REDQ)", (("agent.num_critics", 5), ("agent.num_target_critics", 2))),

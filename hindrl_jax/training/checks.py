@@ -65,6 +65,8 @@ def check_config(env: Environment, config: TrainConfig) -> None:
         missing = "restorable states" if in_jax else "restorable states in JAX"
         raise UserError(f"{name} cannot begin in demonstrated states: it has no {missing}: set demo_reset_ratio to 0")
     if not in_jax:
+        if config.action_chunks:
+            raise UserError(f"action_chunks = True needs a step in JAX, which {name} does not have: set it to False, and each action is held")
         for field, value, off in (("random_truncation", config.random_truncation, 0.0), ("agent_resets", config.agent_resets, ())):
             if value:
                 raise UserError(f"{field} = {value} needs a step in JAX, which {name} does not have: set it to {off}")

@@ -81,11 +81,11 @@ def fit(
         tables = tables.replace(states=None)  # nobody needs them on the devices
 
     num_held = config.num_held
-    tables = hold_demonstrations(tables, num_held)
+    tables = hold_demonstrations(tables, num_held, chunks=config.action_chunks)
     if config.quirks.misaligned_demo_actions and int(tables.lengths.min()) < 2:
         raise UserError("misaligned_demo_actions needs demonstrations of at least 2 steps: turn it off or record others")
     started = time.perf_counter()
-    with contextlib.closing(programs_of(hold(env, num_held), configs, tables)) as programs:
+    with contextlib.closing(programs_of(hold(env, num_held, chunks=config.action_chunks), configs, tables)) as programs:
         kept = nothing_kept(programs.shapes["state"].agent.average_actor)
         result = Result(env=env, configs=configs, seeds=tuple(seeds), **programs.shapes, kept=kept, rows=[], compile_seconds=0.0)
         restored = restore(result)

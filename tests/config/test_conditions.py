@@ -47,6 +47,7 @@ OF_THE_HOST = {
     "eval_every": "how many iterations are run between evaluations",
     "eval_episodes": "how many episodes an evaluation plays; it does not lead back to the policy",
     "stop_at": "ends the run",
+    "action_chunks": "as action_hold",
     "action_hold": "the programs are given another environment and other demonstrations, and count steps by it",
 }
 
@@ -82,6 +83,7 @@ VALUES = {
     "base": ("sac", "tqc", "td3"),
     "net_arch": ((5,), (4,)),
     "layer_norm": (True, False),
+    "residual": (True, False),
     "network_precision": ("bfloat16", "float32"),
     "learning_rate": (1e-2, 1e-4),
     "final_learning_rate": (1e-4, 1e-5),
@@ -174,7 +176,7 @@ BASES = {
         "smooth-hindrl with sac": dict(algo="smooth-hindrl", epsilon_filtering=True, epsilon_steps=1, base="sac", demo_reset_ratio=0.5),
         "joint_union with ddpg": dict(hindrl_sampling_strategy="joint_union", base="ddpg", num_critics=1, final_learning_rate=1e-5),
         "joint_intersection": dict(hindrl_sampling_strategy="joint_intersection", final_bc_weight=0.0),
-        "future with redq": dict(hindrl_sampling_strategy="future", num_critics=3, num_target_critics=2, epsilon=0.1),
+        "future with redq, residual": dict(hindrl_sampling_strategy="future", residual=True, num_critics=3, num_target_critics=2, epsilon=0.1),
         "mixture with priorities": dict(
             hindrl_sampling_strategy="mixture", strategy_mixture=(("random", 1.0), ("joint_intersection", 1.0)), priority_exponent=0.5
         ),

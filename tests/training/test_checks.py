@@ -94,6 +94,7 @@ def with_goals(behavioural_goals):
     [
         (Unrestorable(), dataclasses.replace(CONFIG, demo_reset_ratio=0.5), "it has no restorable states: set demo_reset_ratio to 0"),
         (HostCorridor(), dataclasses.replace(CONFIG, demo_reset_ratio=0.5), "it has no restorable states in JAX: set demo_reset_ratio to 0"),
+        (HostCorridor(), dataclasses.replace(CONFIG, action_chunks=True), "action_chunks = True needs a step in JAX, which HostCorridor"),
         (HostCorridor(), dataclasses.replace(CONFIG, agent_resets=(0.5,)), "needs a step in JAX, which HostCorridor does not have"),
         (HostCorridor(), with_goals("environment"), "HostCorridor, which gives its episodes no goals: choose another"),
         (ENV, with_goals("environment"), "FixedGridPickAndPlace, which gives its episodes no goals: choose another"),
