@@ -83,11 +83,11 @@ CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
     ),
     (
         "bc_loss bc_action unscaled_demo_actions",
-        lambda c: _has_demo_rows(c) or c.bc_warm_start > 0,
+        lambda c: _has_demo_rows(c) or c.clones_first,
         "the batch has no demonstration rows to clone: raise --max-demo-ratio",
     ),
     ("q_filter", _clones, "nothing is cloned: raise --bc-weight"),
-    ("bc_loss bc_action", lambda c: _clones(c) or c.bc_warm_start > 0, "nothing is cloned: raise --bc-weight"),
+    ("bc_loss bc_action", lambda c: _clones(c) or c.clones_first, "nothing is cloned: raise --bc-weight"),
     ("epsilon_steps epsilon_deviations", lambda c: c.goal.epsilon is None, "epsilon itself is given: set it to None"),
     ("epsilon_deviations", lambda c: c.goal.epsilon_steps > 0, "epsilon depends on it only for epsilon_steps > 0: add --epsilon-steps 5"),
     (

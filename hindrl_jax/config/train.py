@@ -50,6 +50,9 @@ class TrainConfig:
     those of short episodes are drawn more often."""
     bc_warm_start: int = 0
     """Gradient steps of behaviour cloning alone before the first of reinforcement learning, after the random actions of learning_starts."""
+    imitation_proposal: int = 0
+    """Gradient steps of behaviour cloning that make a second policy, frozen, which proposes an action beside the actor's: whichever the target
+    critics value more is taken, in episodes, evaluations and targets (IBRL, Hu et al., 2024). 0 for no such policy."""
     agent_resets: tuple[float, ...] = ()
     """Shares of the run, in order, after which networks, optimisers and their schedules begin anew, while the replay stays (Nikishin et al., The
     primacy bias in deep reinforcement learning, 2022)."""
@@ -82,6 +85,7 @@ class TrainConfig:
             demo_reset_curriculum=(0.0 <= self.demo_reset_curriculum <= 1.0, "between 0 and 1"),
             random_truncation=(0.0 <= self.random_truncation < 1.0, "0 or more, and less than 1"),
             bc_warm_start=(self.bc_warm_start >= 0, "0 or more"),
+            imitation_proposal=(self.imitation_proposal >= 0, "0 or more"),
             agent_resets=(
                 all(0.0 < share < 1.0 for share in self.agent_resets) and sorted(set(self.agent_resets)) == list(self.agent_resets),
                 "shares between 0 and 1, each larger than the one before",
@@ -92,7 +96,8 @@ class TrainConfig:
         if self.action_chunks and self.action_hold == 1:
             raise ValueError("action_chunks = True is of no use while action_hold = 1: raise that, too, or set it to None")
         if self.algo == "bc":
-            given: dict[str, Any] = {"bc_warm_start": self.bc_warm_start, "q_filter": self.agent.q_filter != "off" and self.agent.q_filter}
+            given: dict[str, Any] = {"bc_warm_start": self.bc_warm_start, "imitation_proposal": self.imitation_proposal}
+            given |= {"q_filter": self.agent.q_filter != "off" and self.agent.q_filter}
             given |= {"priority_exponent": self.priority.priority_exponent, "base": self.agent.base != "tqc" and self.agent.base}
             for name, value in given.items():
                 if value:
@@ -123,6 +128,11 @@ class TrainConfig:
     def num_updates(self) -> int:
         """Gradient steps for each decision of all environments."""
         return self.updates_per_iteration or max(1, round(self.steps_per_iteration / STEPS_PER_UPDATE))
+
+    @property
+    def clones_first(self) -> bool:
+        """Whether something is cloned before the first gradient step of reinforcement learning: the actor, or what proposes beside it."""
+        return self.bc_warm_start > 0 or self.imitation_proposal > 0
 
     @property
     def learns_from_rollouts(self) -> bool:

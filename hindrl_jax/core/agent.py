@@ -20,17 +20,10 @@ from flax import struct
 
 from hindrl_jax.base.types import Array, Transition, tree_where
 from hindrl_jax.config import TrainConfig
+from hindrl_jax.core.comparison import better, probability_of_being_better
 from hindrl_jax.core.inputs import InputScale, network_inputs
 from hindrl_jax.core.kernels import mean_over_blocks, num_blocks
-from hindrl_jax.core.losses import (
-    behaviour_cloning,
-    entropy_coefficient,
-    probability_of_being_better,
-    quantile_huber,
-    squared_error,
-    target_atoms,
-    target_value,
-)
+from hindrl_jax.core.losses import behaviour_cloning, entropy_coefficient, quantile_huber, squared_error, target_atoms, target_value
 from hindrl_jax.core.networks import Params, apply_actor, apply_critics, init_actor, init_critics, mean_return, mean_returns
 from hindrl_jax.core.schedules import Schedule
 
@@ -49,6 +42,7 @@ class AgentState(struct.PyTreeNode, kw_only=True):
     target_actor: Params | None  # follows the actor as the target critics follow the critics; None for algorithms without one
     critics: Params  # leaves (C, ...)
     target_critics: Params  # leaves (C, ...)
+    imitation: Params | None  # a clone of the demonstrations, frozen, that proposes actions beside the actor; None where none does
     log_alpha: Array  # ()
     actor_optimiser: optax.OptState
     critic_optimiser: optax.OptState
@@ -59,7 +53,7 @@ class AgentState(struct.PyTreeNode, kw_only=True):
 class Policy(struct.PyTreeNode, kw_only=True):
     """What acting needs."""
 
-    actor: Params
+    actor: Params  # with `imitation_proposal` a dict of the actor, the imitation and the critics that choose between the two
     scale: InputScale
 
 
@@ -76,6 +70,7 @@ def init(key: Array, scale: InputScale, config: TrainConfig, *, action_dim: int)
         target_actor=None if config.agent.has_entropy else jax.tree.map(jnp.copy, actor),
         critics=critics,
         target_critics=jax.tree.map(jnp.copy, critics),
+        imitation=jax.tree.map(jnp.copy, actor) if config.imitation_proposal > 0 else None,
         log_alpha=log_alpha,
         actor_optimiser=_ADAM.init(actor),
         critic_optimiser=_ADAM.init(critics),
@@ -86,14 +81,24 @@ def init(key: Array, scale: InputScale, config: TrainConfig, *, action_dim: int)
 
 def policy(state: AgentState, *, average: bool) -> Policy:
     """The policy that explores, or with `average` the steadier one that is evaluated and saved."""
-    return Policy(actor=state.average_actor if average else state.actor, scale=state.scale)
+    actor = state.average_actor if average else state.actor
+    if state.imitation is not None:
+        actor = {"actor": actor, "imitation": state.imitation, "critics": state.target_critics}
+    return Policy(actor=actor, scale=state.scale)
 
 
 def select_action(key: Array, actor: Params, inputs: Array, config: TrainConfig, *, action_dim: int, stochastic: bool) -> Array:
-    """Actions (B, A) in [-1, 1] at inputs (B, input_dim), see `inputs.network_inputs`: sampled from the policy, or its mode.
+    """Actions (B, A) in [-1, 1] at inputs (B, input_dim), see `inputs.network_inputs`: sampled from a policy's actor, or its mode.
 
-    The samples of a deterministic policy (td3, ddpg) are its mode with noise.
+    The samples of a deterministic policy (td3, ddpg) are its mode with noise. With `imitation_proposal` the critics choose, see `Policy.actor`.
     """
+    if config.imitation_proposal > 0:
+        own = _own_action(key, actor["actor"], inputs, config, action_dim=action_dim, stochastic=stochastic)
+        return _better(own.T, actor["imitation"], actor["critics"], inputs.T, config)[0].T
+    return _own_action(key, actor, inputs, config, action_dim=action_dim, stochastic=stochastic)
+
+
+def _own_action(key: Array, actor: Params, inputs: Array, config: TrainConfig, *, action_dim: int, stochastic: bool) -> Array:
     distribution = apply_actor(actor, inputs.T, config.agent, action_dim=action_dim)
     if not stochastic:
         return distribution.mode.T
@@ -191,6 +196,9 @@ def _prepare(key: Array, state: AgentState, batch: Transition, config: TrainConf
 def _targets(state: AgentState, target_critics: Params, config: TrainConfig, block: _Columns) -> Array:
     """What the critics of each column are moved towards: (M, B) target atoms, or (1, B) without quantiles."""
     next_action, entropy_bonus = _next_action(state, config, block)
+    if state.imitation is not None:
+        next_action, is_own = _better(next_action, state.imitation, target_critics, block.next_inputs, config)
+        entropy_bonus = jnp.where(is_own, entropy_bonus, 0.0)  # the imitating policy is not random
     next_atoms = apply_critics(target_critics, block.next_inputs, next_action, config.agent)  # (C, Q, B)
     bellman = dict(reward=block.reward, discount=block.discount, entropy_bonus=entropy_bonus)
     if config.agent.base == "tqc":
@@ -217,6 +225,12 @@ def _next_action(state: AgentState, config: TrainConfig, block: _Columns) -> tup
         noise = jnp.clip(agent.target_noise * block.next_noise, -agent.target_noise_clip, agent.target_noise_clip)
         action = jnp.clip(action + noise, -1.0, 1.0)
     return action, jnp.zeros(action.shape[1])
+
+
+def _better(own: Array, imitation: Params, critics: Params, inputs: Array, config: TrainConfig) -> tuple[Array, Array]:
+    """Of the actor's actions (A, B) and the imitating policy's mean ones those that the critics value more, see `comparison.better`."""
+    actions = own, apply_actor(imitation, inputs, config.agent, action_dim=own.shape[0]).mode
+    return better(actions, (_value(critics, inputs, actions[0], config), _value(critics, inputs, actions[1], config)))
 
 
 def _critic_gradient(state: AgentState, target_critics: Params, config: TrainConfig, block: _Columns) -> tuple[Params, Metrics]:

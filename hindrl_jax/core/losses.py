@@ -15,7 +15,6 @@ from hindrl_jax.core import kernels
 
 _LEAST_SQUARED_LENGTH = 1e-3  # of actions; demonstrations that hardly do anything are not blown up
 _LEAST_WEIGHT = 1e-6  # of a batch, whose weights may all be 0
-_LEAST_VARIANCE = 1e-12  # critics that agree to the last digit do not divide by 0
 
 
 def quantile_huber(quantiles: Array, targets: Array) -> Array:
@@ -99,27 +98,6 @@ def behaviour_cloning(policy_action: Array, demonstrated_action: Array, weight: 
         return loss
     length = jnp.sum(weight * jnp.sum(jnp.square(demonstrated_action), axis=0)) / jnp.maximum(jnp.sum(weight), _LEAST_WEIGHT)
     return loss / jnp.maximum(length, _LEAST_SQUARED_LENGTH)
-
-
-def probability_of_being_better(values: Array, other_values: Array) -> Array:
-    """How sure an ensemble of critics is that one action is better than another (SPReD-P; Zhu et al., smooth policy regularisation, 2025).
-
-    Each action's value is taken for a Gaussian with the mean m and the variance v of the critics' values, and the two for independent:
-    Phi((m - m') / sqrt(v + v')).
-
-    Args:
-      values, other_values: (C, B), of C >= 2 critics.
-
-    Returns:
-      (B,) in [0, 1], without gradient.
-
-    Example:
-      >>> probability_of_being_better(jnp.array([[1.0], [3.0]]), jnp.array([[2.0], [2.0]])).tolist()
-      [0.5]
-    """
-    difference = jnp.mean(values, axis=0) - jnp.mean(other_values, axis=0)
-    variance = jnp.var(values, axis=0) + jnp.var(other_values, axis=0)
-    return jax.lax.stop_gradient(jax.scipy.stats.norm.cdf(difference / jnp.sqrt(variance + _LEAST_VARIANCE)))
 
 
 def entropy_coefficient(log_alpha: Array, log_prob: Array, *, target_entropy: Array | float) -> Array:

@@ -148,7 +148,7 @@ def _reset_agent_if_due(state: TrainState, env: Environment, config: TrainConfig
     key, key_agent = jax.random.split(state.key)
     due, anew = passed > state.resets, agents.init(key_agent, state.agent.scale, config, action_dim=env.action_dim)
     return state.replace(
-        agent=tree_where(due, anew, state.agent),
+        agent=tree_where(due, anew.replace(imitation=state.agent.imitation), state.agent),
         key=key,
         resets=passed,
         updates_at_reset=jnp.where(due, state.updates, state.updates_at_reset),
@@ -295,6 +295,13 @@ def clone(state: TrainState, guidance: Guidance, *, env: Environment, config: Tr
 
     state, metrics = jax.lax.scan(gradient_step, state, length=num_iterations)
     return state, jax.tree.map(jnp.mean, metrics)
+
+
+def imitate(state: TrainState, guidance: Guidance, *, env: Environment, config: TrainConfig) -> TrainState:
+    """Clones the policy that proposes actions beside the actor, by `imitation_proposal` gradient steps; all else stays as it is."""
+    key, key_clone = jax.random.split(state.key)
+    clone_of, _ = clone(state.replace(key=key_clone), guidance, env=env, config=config, num_iterations=config.imitation_proposal)
+    return state.replace(key=key, agent=state.agent.replace(imitation=clone_of.agent.actor))
 
 
 def evaluate(key: Array, policy: Policy, guidance: Guidance, *, env: Steppable, config: TrainConfig, num_episodes: int) -> Evaluation:

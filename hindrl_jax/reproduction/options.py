@@ -153,6 +153,12 @@ OPTIONS: tuple[Option, ...] = (
     ),
     Option("value-relative", "demonstrations", "value in the actor's loss over its own size, row by row", (("agent.relative_value", True),)),
     Option("bc-warm-start", "demonstrations", "500 gradient steps of cloning before the first of reinforcement learning", (("bc_warm_start", 500),)),
+    Option(
+        "imitation-proposal",
+        "demonstrations",
+        "a policy cloned by 2,000 gradient steps proposes beside the actor, and the critics choose (IBRL)",
+        (("imitation_proposal", 2_000),),
+    ),
     Option("bc-norm", "demonstrations", "cloning loss is the distance, not its square (original code)", (("quirks.bc_loss", "norm"),)),
     Option("bc-sample", "demonstrations", "cloning loss of a sampled action, not of the mean one (original code)", (("quirks.bc_action", "sample"),)),
     Option(

@@ -60,6 +60,7 @@ VALUES = {
     "demo_reset_curriculum": (0.5, 0.25),
     "random_truncation": (0.1, 0.2),
     "bc_warm_start": (2, 3),
+    "imitation_proposal": (2, 3),
     "agent_resets": ((0.5,), (0.25,)),
     "buffer_size": (60, 40),
     "batch_size": (16, 8),
@@ -183,6 +184,7 @@ BASES = {
         "no relabelling": dict(relabelled_per_original=0.0, final_target_entropy=None),
         "no demonstration rows": dict(max_demo_ratio=0.0),
         "no demonstration rows, a warm start": dict(max_demo_ratio=0.0, bc_warm_start=1),
+        "no demonstration rows, proposals of a clone": dict(max_demo_ratio=0.0, imitation_proposal=1),
         "no cloning": dict(bc_weight=0.0, agent_resets=(0.4,)),
     }.items()
 }

@@ -144,6 +144,8 @@ BAD = [
     (TrainConfig, "agent_resets", [(0.0,), (1.0,), (0.5, 0.5), (0.6, 0.3), (0.5, "1"), 0.5, None]),
     (TrainConfig, "demo_reset_curriculum", [-0.1, 1.1, 0.5]),  # 0.5 without resets to demonstrated states
     (TrainConfig, "bc_warm_start", [-1, 0.5]),
+    (TrainConfig, "imitation_proposal", [-1, True]),
+    (TrainConfig, "action_chunks", [1, None]),
     (TrainConfig, "buffer_size", [0, 1e6]),
     (TrainConfig, "eval_every", [0]),
     (TrainConfig, "eval_episodes", [0]),
@@ -211,6 +213,7 @@ def test_the_algorithm_must_fit_its_settings(fitting, contradiction, name):
     "changes",
     [
         dict(bc_warm_start=1),
+        dict(imitation_proposal=1),
         dict(agent=AgentConfig(q_filter="hard")),
         dict(agent=AgentConfig(base="sac")),
         dict(priority=PriorityConfig(priority_exponent=0.5)),

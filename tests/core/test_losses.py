@@ -5,15 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hindrl_jax.core.losses import (
-    behaviour_cloning,
-    entropy_coefficient,
-    probability_of_being_better,
-    quantile_huber,
-    squared_error,
-    target_atoms,
-    target_value,
-)
+from hindrl_jax.core.losses import behaviour_cloning, entropy_coefficient, quantile_huber, squared_error, target_atoms, target_value
 
 
 @pytest.mark.parametrize(
@@ -121,18 +113,6 @@ def test_small_weights_stay_small():
     value = behaviour_cloning(jnp.array([[3.0, 3.0]]), jnp.array([[2.0, 9.0]]), jnp.array([1e-3, 0.0]), form="relative")
     np.testing.assert_allclose(value, 1e-3 / 8, rtol=1e-5)
     assert not behaviour_cloning(jnp.ones((1, 2)), jnp.zeros((1, 2)), jnp.zeros(2, bool), form="relative")
-
-
-def test_probability_of_being_better_by_hand():
-    # Column 0: means 2 and 0.5, variances 1 and 0.25: Phi(1.5 / sqrt(1.25) = 1.3416) = 0.91014. Column 1: the other way round. Column 2: equal means.
-    # Column 3: certain, and worse by 1.
-    values = jnp.array([[1.0, 0.0, 2.0, 3.0], [3.0, 1.0, 4.0, 3.0]])
-    others = jnp.array([[0.0, 1.0, 3.0, 4.0], [1.0, 3.0, 3.0, 4.0]])
-    np.testing.assert_allclose(probability_of_being_better(values, others), [0.91014, 0.08986, 0.5, 0.0], atol=1e-4)
-    # Three critics, of whom one disagrees: means 1 and 0, variances 2 and 0: Phi(1 / sqrt(2) = 0.7071) = 0.76025.
-    np.testing.assert_allclose(probability_of_being_better(jnp.array([[0.0], [0.0], [3.0]]), jnp.zeros((3, 1))), [0.76025], atol=1e-4)
-    for gradient in jax.grad(lambda *given: probability_of_being_better(*given).sum(), argnums=(0, 1))(values, others):
-        assert not gradient.any()
 
 
 @pytest.mark.parametrize(
