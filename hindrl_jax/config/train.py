@@ -40,9 +40,9 @@ class TrainConfig:
     demo_reset_ratio: float = 0.0
     """Share of training episodes that begin in a demonstrated state, drawn uniformly, with the steps that it had left (Nair et al., overcoming
     exploration in reinforcement learning with demonstrations, 2018). Evaluations never do."""
-    demo_reset_curriculum: float = 0.0
-    """Share of the run over which those states widen from the end of each demonstration to all of it: a reverse curriculum (RFCL, Tao et al.,
-    2024, widens by success instead). 0 draws from all of them throughout."""
+    demo_reset_curriculum: bool = False
+    """Those states are near the end of each demonstration at first, and move towards its beginning where episodes succeed from them three times in a
+    row: the reverse curriculum of RFCL (Tao et al., 2024)."""
     random_truncation: float = 0.0
     """Probability with which a training episode is cut off after a step, as a time-out cuts it: the future value still counts (unless
     timeouts_are_terminal). Episodes that stand still are left sooner, and more are begun. Evaluations are never cut. Each episode keeps room for a
@@ -82,7 +82,6 @@ class TrainConfig:
             stop_at=(self.stop_at is None or 0.0 < self.stop_at <= 1.0, "greater than 0 and at most 1, or None"),
             learning_starts=(self.learning_starts >= 0, "0 or more"),
             demo_reset_ratio=(0.0 <= self.demo_reset_ratio <= 1.0, "between 0 and 1"),
-            demo_reset_curriculum=(0.0 <= self.demo_reset_curriculum <= 1.0, "between 0 and 1"),
             random_truncation=(0.0 <= self.random_truncation < 1.0, "0 or more, and less than 1"),
             bc_warm_start=(self.bc_warm_start >= 0, "0 or more"),
             imitation_proposal=(self.imitation_proposal >= 0, "0 or more"),
@@ -91,7 +90,7 @@ class TrainConfig:
                 "shares between 0 and 1, each larger than the one before",
             ),
         )
-        if self.demo_reset_curriculum > 0.0 and self.demo_reset_ratio == 0.0:
+        if self.demo_reset_curriculum and self.demo_reset_ratio == 0.0:
             raise ValueError(f"demo_reset_curriculum = {self.demo_reset_curriculum} is of no use while demo_reset_ratio = 0: raise that, too")
         if self.action_chunks and self.action_hold == 1:
             raise ValueError("action_chunks = True is of no use while action_hold = 1: raise that, too, or set it to None")

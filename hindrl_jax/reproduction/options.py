@@ -171,8 +171,8 @@ OPTIONS: tuple[Option, ...] = (
     Option(
         "demo-resets-reverse",
         "demonstrations",
-        "half of all episodes begin in demonstrated states, the last ones first (RFCL)",
-        (("demo_reset_ratio", 0.5), ("demo_reset_curriculum", 0.5)),
+        "half of all episodes begin in demonstrated states, the last ones first, and earlier ones where these succeed (RFCL)",
+        (("demo_reset_ratio", 0.5), ("demo_reset_curriculum", True)),
     ),
     Option("layer-norm", "critic", "layer normalisation in the critics (RLPD)", (("agent.layer_norm", True),)),
     Option("residual", "critic", "residual blocks of width 64, four of them, in critics and actor (SimBa)", (("agent.residual", True),)),

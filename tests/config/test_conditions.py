@@ -57,7 +57,7 @@ VALUES = {
     "updates_per_iteration": (2, 1),
     "learning_starts": (30, 20),
     "demo_reset_ratio": (0.5, 0.25),
-    "demo_reset_curriculum": (0.5, 0.25),
+    "demo_reset_curriculum": (True, False),
     "random_truncation": (0.1, 0.2),
     "bc_warm_start": (2, 3),
     "imitation_proposal": (2, 3),

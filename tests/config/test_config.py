@@ -142,7 +142,7 @@ BAD = [
     (TrainConfig, "action_hold", [0, -1, 2.5]),
     (TrainConfig, "stop_at", [0.0, -0.1, 1.01]),
     (TrainConfig, "agent_resets", [(0.0,), (1.0,), (0.5, 0.5), (0.6, 0.3), (0.5, "1"), 0.5, None]),
-    (TrainConfig, "demo_reset_curriculum", [-0.1, 1.1, 0.5]),  # 0.5 without resets to demonstrated states
+    (TrainConfig, "demo_reset_curriculum", [0.5, True]),  # True without resets to demonstrated states
     (TrainConfig, "bc_warm_start", [-1, 0.5]),
     (TrainConfig, "imitation_proposal", [-1, True]),
     (TrainConfig, "action_chunks", [1, None]),
