@@ -122,7 +122,7 @@ def _rlpd(algo: Algorithm, env: Environment) -> TrainConfig:
     for each environment step; no cloning. What is relabelled is the algorithm's business: tqcfd is the paper's.
 
     Differences from the paper: the actor, too, takes all 20 of these steps, in the paper one; and a batch has 128 demonstration rows however few
-    demonstrations there are. The width is the paper's, and one gradient step takes some 30 times as long as one of the default recipe on a CPU.
+    demonstrations there are. The width is the paper's; on a CPU one gradient step takes 15 times as long as one of the default recipe.
 
     Raises:
       UserError: for behaviour cloning.
