@@ -70,7 +70,7 @@ def plain(action_dim: int) -> Form:
 
 def own(config: AgentConfig, action_dim: int, batch_size: int) -> Form:
     """The networks of hindrl_jax, over the blocks that `agent.update` cuts."""
-    num_blocks = kernels.num_blocks(batch_size, max(config.net_arch))
+    num_blocks = kernels.num_blocks(batch_size, config.widest_layer)
 
     def mean_gradient(gradient: Callable[[Batch], Params], batch: Batch) -> Params:
         return kernels.mean_over_blocks(gradient, batch, num_blocks)

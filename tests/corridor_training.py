@@ -33,8 +33,8 @@ def make_config(**changes):
             layer_norm=False,
             num_quantiles=5,
             top_quantiles_to_drop_per_net=1,
-            target_entropy=-1000.0,
-            final_target_entropy=1000.0,
+            target_entropy=-500.0,
+            final_target_entropy=500.0,
         ),
     )
     return dataclasses.replace(config, **changes)

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hindrl_jax.base.environments import action_from_env
+from hindrl_jax.base.environments import action_from_env, command_of
 from hindrl_jax.base.types import Array, Episodes, TimeStep
 from hindrl_jax.envs.reach import ReachState, ReachTask
 from hindrl_jax.experts.robosuite_arm.arm import RobosuiteArm, shared_arm
@@ -67,8 +67,8 @@ def play_episode(key: Array, env: ReachTask, arm: RobosuiteArm, act: Act, num_he
     for index in range(env.horizon):
         key, key_act = jax.random.split(key)
         if index % num_held == 0:
-            action = act(key_act, state, observation)
-        command, normalised = _command(env, action)
+            decision = act(key_act, state, observation)
+        command, normalised = _command(env, command_of(decision, index % num_held, env.action_dim))
         joints, velocities = arm.step(np.asarray(command))
         state, time_step, vector = _arrive(env, state, np.float32(joints), np.float32(velocities))
         observation = time_step.observation

@@ -149,6 +149,23 @@ def action_from_env(action: Array, env: Environment) -> Array:
     return 2.0 * (action - low) / (high - low) - 1.0
 
 
+def command_of(decision: Array, index: Array | int, action_dim: int) -> Array:
+    """What is done at one of the control steps of a decision (`core.holding`): the action (..., A) that is held, or that one of a chunk (..., k A).
+
+    Args:
+      decision: (..., A) or (..., k A).
+      index: which of the control steps, 0 .. k - 1.
+      action_dim: A.
+
+    Example:
+      >>> command_of(jnp.array([1.0, 2.0, 3.0, 4.0]), 1, 2).tolist(), command_of(jnp.array([1.0, 2.0]), 1, 2).tolist()
+      ([3.0, 4.0], [1.0, 2.0])
+    """
+    if decision.shape[-1] == action_dim:
+        return decision
+    return jnp.take(decision.reshape(*decision.shape[:-1], -1, action_dim), index, axis=-2)
+
+
 def _action_bounds(action: Array, env: Environment) -> tuple[Array, Array]:
     low, high = (jnp.broadcast_to(jnp.asarray(bound, action.dtype), action.shape) for bound in (env.action_low, env.action_high))
     return low, high

@@ -103,7 +103,8 @@ def run(spec: RunSpec, configs: Sequence[TrainConfig], writer: RunWriter | Sweep
             num_held = result.config.num_held
             if num_held > 1:
                 steps = int(np.median([table.lengths for table in demonstrations]))
-                progress.say(f"each action is held for {num_held} steps, so a demonstration of {steps} steps takes {-(-steps // num_held)} decisions")
+                what = f"a decision is {num_held} actions" if result.config.action_chunks else f"each action is held for {num_held} steps"
+                progress.say(f"{what}, so a demonstration of {steps} steps takes {-(-steps // num_held)} decisions")
             for share in spec.config.agent_resets:
                 progress.say(f"the agent begins anew at step {share * spec.config.num_steps:,.0f}, so success will drop there and come back")
             if resumes:

@@ -89,7 +89,7 @@ def parse_train(
     spec = _defaults(chosen)
     fields: list[tuple[str, Any, Any, str]] = [
         ("env", env_names(chosen["env"] or spec.env.name), spec.env.name, ENV_HELP),
-        ("preset", Preset, chosen["preset"] or "default", "Where the other defaults come from: our recipe, the thesis, or its original code."),
+        ("preset", Preset, chosen["preset"] or "default", "Where the other defaults come from: our recipe, the thesis, its original code, or RLPD."),
         ("config", Path | None, None, "Run again what a config.json (or the directory of a run) says; other flags change it."),
         ("resume", Path | None, None, "Go on with the run, or sweep, of a directory that was stopped or killed, as if it had never been."),
         ("run", options_class, options_class(demos=spec.demos), ""),

@@ -4,7 +4,7 @@
 own recipe; the thesis's settings and the original code's are presets (`hindrl_jax.tasks.presets`).
 """
 
-from hindrl_jax.config.agent import AgentConfig
+from hindrl_jax.config.agent import RESIDUAL_EXPANSION, AgentConfig
 from hindrl_jax.config.batch import BatchConfig, Source, Strategy
 from hindrl_jax.config.conditions import without_effect
 from hindrl_jax.config.goal import GoalConfig
@@ -20,6 +20,7 @@ __all__ = [
     "GoalConfig",
     "PriorityConfig",
     "QuirksConfig",
+    "RESIDUAL_EXPANSION",
     "SWEEPABLE",
     "Source",
     "Strategy",

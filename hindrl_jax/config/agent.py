@@ -7,6 +7,9 @@ from typing import Literal
 
 from hindrl_jax.base.checks import check, check_types
 
+RESIDUAL_EXPANSION = 4
+"""Width inside a residual block, over that of the block."""
+
 
 @dataclasses.dataclass(frozen=True)
 class AgentConfig:
@@ -17,7 +20,10 @@ class AgentConfig:
     net_arch: tuple[int, ...] = (64, 64, 64, 64)
     """Widths of the hidden layers, the same for actor and critics."""
     layer_norm: bool = True
-    """Layer normalisation before each activation of the critics."""
+    """Layer normalisation before each activation of the critics; residual networks have their own."""
+    residual: bool = False
+    """Residual networks, actor and critics (SimBa; Lee et al., 2024): an embedding, then for each of the widths, which must be equal, a block
+    x + W2 relu(W1 LN(x)) that is four times as wide inside, then layer normalisation."""
     learning_rate: float = 1e-3
     """Adam's step size, for actor, critics and entropy coefficient."""
     clip_targets: bool = True
@@ -44,8 +50,10 @@ class AgentConfig:
     """Where the target entropy has moved, linearly, by the end of the run; None keeps it constant."""
     bc_weight: float = 0.05
     """Weight of the behaviour cloning loss on demonstration rows (lambda_BC of the thesis)."""
-    q_filter: bool = False
-    """Clone only the demonstrated actions that the critics value above the policy's own (Nair et al., 2018, eq. 4)."""
+    q_filter: Literal["off", "hard", "smooth"] = "off"
+    """Clone only the demonstrated actions that the critics value above the policy's own (hard; Nair et al., 2018, eq. 4), or each in proportion to
+    the probability that it is better (smooth; SPReD, Zhu et al., 2025), where the critics' values, tqc's the means of their quantiles, are an
+    ensemble."""
     input_encoding: Literal["raw", "multiscale", "standardised"] = "multiscale"
     """Networks see inputs as they are (thesis); or less their mean in the demonstrations, over their standard deviation; or (multiscale) that and
     tanh(4 x), x being the input over its root mean square there."""
@@ -71,6 +79,15 @@ class AgentConfig:
             initial_alpha=(self.initial_alpha > 0.0, "greater than 0"),
             bc_weight=(self.bc_weight >= 0.0, "0 or more"),
         )
+        if self.residual and len(set(self.net_arch)) > 1:
+            raise ValueError(f"residual adds up layers of equal widths, but net_arch = {self.net_arch}: give equal ones, or turn residual off")
+        if self.q_filter == "smooth" and self.num_critics < 2:
+            raise ValueError("q_filter = smooth compares the critics' values with each other, but num_critics = 1: raise it, or choose hard")
+
+    @property
+    def widest_layer(self) -> int:
+        """Units of the widest hidden layer."""
+        return max(self.net_arch) * (RESIDUAL_EXPANSION if self.residual else 1)
 
     @property
     def critic_outputs(self) -> int:

@@ -39,6 +39,7 @@ CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
         "behaviour cloning does not use it: choose another algo",
     ),
     ("num_quantiles top_quantiles_to_drop_per_net", lambda c: c.agent.base == "tqc", "{base} has no quantiles: choose --base tqc"),
+    ("layer_norm", lambda c: not c.agent.residual, "residual networks have layer normalisation of their own: set --no-residual"),
     (
         "hindrl_sampling_strategy union_sampling_ratio intersection_goals",
         _relabels,
@@ -70,11 +71,11 @@ CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
     ("bc_weight q_filter", _has_demo_rows, "the batch has no demonstration rows to clone: raise --max-demo-ratio"),
     (
         "bc_loss bc_action unscaled_demo_actions",
-        lambda c: _has_demo_rows(c) or c.bc_warm_start > 0,
+        lambda c: _has_demo_rows(c) or c.clones_first,
         "the batch has no demonstration rows to clone: raise --max-demo-ratio",
     ),
     ("q_filter", _clones, "nothing is cloned: raise --bc-weight"),
-    ("bc_loss bc_action", lambda c: _clones(c) or c.bc_warm_start > 0, "nothing is cloned: raise --bc-weight"),
+    ("bc_loss bc_action", lambda c: _clones(c) or c.clones_first, "nothing is cloned: raise --bc-weight"),
     ("epsilon_steps epsilon_deviations", lambda c: c.goal.epsilon is None, "epsilon itself is given: set it to None"),
     ("epsilon_deviations", lambda c: c.goal.epsilon_steps > 0, "epsilon depends on it only for epsilon_steps > 0: add --epsilon-steps 5"),
     (

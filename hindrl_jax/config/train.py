@@ -33,6 +33,9 @@ class TrainConfig:
     action_hold: int | None = None
     """Control steps for which each action is held: one decision of the policy. Steps, horizon and episode lengths count control steps; epsilon_steps,
     n_step and gamma count decisions. None lets `fit` choose: as many as leave the median demonstration at least 60 decisions."""
+    action_chunks: bool = False
+    """Each decision is as many different actions in place of one that is held, played one after the other, and the critics value all of them together
+    (Q-chunking; Li, Zhou and Levine, 2025). action_hold says how many."""
     updates_per_iteration: int | None = None
     """Gradient steps after each decision of all environments; None takes one for every 4 control steps."""
     learning_starts: int = 0
@@ -40,11 +43,14 @@ class TrainConfig:
     demo_reset_ratio: float = 0.0
     """Share of training episodes that begin in a demonstrated state, drawn uniformly, with the steps that it had left (Nair et al., overcoming
     exploration in reinforcement learning with demonstrations, 2018). Evaluations never do."""
-    demo_reset_curriculum: float = 0.0
-    """Share of the run over which those states widen from the end of each demonstration to all of it: a reverse curriculum (RFCL, Tao et al.,
-    2024, widens by success instead). 0 draws from all of them throughout."""
+    demo_reset_curriculum: bool = False
+    """Those states are near the end of each demonstration at first, and move towards its beginning where episodes succeed from them three times in a
+    row: the reverse curriculum of RFCL (Tao et al., 2024)."""
     bc_warm_start: int = 0
     """Gradient steps of behaviour cloning alone before the first of reinforcement learning, after the random actions of learning_starts."""
+    imitation_proposal: int = 0
+    """Gradient steps of behaviour cloning that make a second policy, frozen, which proposes an action beside the actor's: whichever the target
+    critics value more is taken, in episodes, evaluations and targets (IBRL, Hu et al., 2024). 0 for no such policy."""
     agent_resets: tuple[float, ...] = ()
     """Shares of the run, in order, after which networks, optimisers and their schedules begin anew, while the replay stays (Nikishin et al., The
     primacy bias in deep reinforcement learning, 2022)."""
@@ -75,17 +81,20 @@ class TrainConfig:
             stop_at=(self.stop_at is None or 0.0 < self.stop_at <= 1.0, "greater than 0 and at most 1, or None"),
             learning_starts=(self.learning_starts >= 0, "0 or more"),
             demo_reset_ratio=(0.0 <= self.demo_reset_ratio <= 1.0, "between 0 and 1"),
-            demo_reset_curriculum=(0.0 <= self.demo_reset_curriculum <= 1.0, "between 0 and 1"),
             bc_warm_start=(self.bc_warm_start >= 0, "0 or more"),
+            imitation_proposal=(self.imitation_proposal >= 0, "0 or more"),
             agent_resets=(
                 all(0.0 < share < 1.0 for share in self.agent_resets) and sorted(set(self.agent_resets)) == list(self.agent_resets),
                 "shares between 0 and 1, each larger than the one before",
             ),
         )
-        if self.demo_reset_curriculum > 0.0 and self.demo_reset_ratio == 0.0:
+        if self.demo_reset_curriculum and self.demo_reset_ratio == 0.0:
             raise ValueError(f"demo_reset_curriculum = {self.demo_reset_curriculum} is of no use while demo_reset_ratio = 0: raise that, too")
+        if self.action_chunks and self.action_hold == 1:
+            raise ValueError("action_chunks = True is of no use while action_hold = 1: raise that, too, or set it to None")
         if self.algo == "bc":
-            given: dict[str, Any] = {"bc_warm_start": self.bc_warm_start, "q_filter": self.agent.q_filter}
+            given: dict[str, Any] = {"bc_warm_start": self.bc_warm_start, "imitation_proposal": self.imitation_proposal}
+            given |= {"q_filter": self.agent.q_filter != "off" and self.agent.q_filter}
             given |= {"priority_exponent": self.priority.priority_exponent, "base": self.agent.base != "tqc" and self.agent.base}
             for name, value in given.items():
                 if value:
@@ -121,6 +130,11 @@ class TrainConfig:
     def num_updates(self) -> int:
         """Gradient steps for each decision of all environments."""
         return self.updates_per_iteration or max(1, round(self.steps_per_iteration / STEPS_PER_UPDATE))
+
+    @property
+    def clones_first(self) -> bool:
+        """Whether something is cloned before the first gradient step of reinforcement learning: the actor, or what proposes beside it."""
+        return self.bc_warm_start > 0 or self.imitation_proposal > 0
 
     @property
     def learns_from_rollouts(self) -> bool:

@@ -18,10 +18,11 @@ from flax import struct
 
 from hindrl_jax.base.types import Array, Transition
 from hindrl_jax.config import TrainConfig
+from hindrl_jax.core.comparison import better, probability_of_being_better
 from hindrl_jax.core.inputs import InputScale, network_inputs
 from hindrl_jax.core.kernels import mean_over_blocks, num_blocks
 from hindrl_jax.core.losses import behaviour_cloning, entropy_coefficient, quantile_huber, squared_error, target_atoms, target_value
-from hindrl_jax.core.networks import Params, apply_actor, apply_critics, init_actor, init_critics, mean_return
+from hindrl_jax.core.networks import Params, apply_actor, apply_critics, init_actor, init_critics, mean_return, mean_returns
 from hindrl_jax.core.schedules import Schedule
 
 Metrics = dict[str, Array]
@@ -36,6 +37,7 @@ class AgentState(struct.PyTreeNode, kw_only=True):
     average_actor: Params  # running average of the actor, which acts more steadily
     critics: Params  # leaves (C, ...)
     target_critics: Params  # leaves (C, ...)
+    imitation: Params | None  # a clone of the demonstrations, frozen, that proposes actions beside the actor; None where none does
     log_alpha: Array  # ()
     actor_optimiser: optax.OptState
     critic_optimiser: optax.OptState
@@ -46,7 +48,7 @@ class AgentState(struct.PyTreeNode, kw_only=True):
 class Policy(struct.PyTreeNode, kw_only=True):
     """What acting needs."""
 
-    actor: Params
+    actor: Params  # with `imitation_proposal` a dict of the actor, the imitation and the critics that choose between the two
     scale: InputScale
     noise: Array  # () of its actions, before tanh, over the standard deviation that the actor gives them: 0 for the mean action, 1 for sampled ones
 
@@ -63,6 +65,7 @@ def init(key: Array, scale: InputScale, config: TrainConfig, *, action_dim: int)
         average_actor=jax.tree.map(jnp.copy, actor),
         critics=critics,
         target_critics=jax.tree.map(jnp.copy, critics),
+        imitation=jax.tree.map(jnp.copy, actor) if config.imitation_proposal > 0 else None,
         log_alpha=log_alpha,
         actor_optimiser=_ADAM.init(actor),
         critic_optimiser=_ADAM.init(critics),
@@ -73,14 +76,24 @@ def init(key: Array, scale: InputScale, config: TrainConfig, *, action_dim: int)
 
 def policy(state: AgentState, *, average: bool) -> Policy:
     """The policy that explores, or with `average` the mean actions of the steadier one that is evaluated and saved. Leaves (..., ) as the state's."""
+    actor = state.average_actor if average else state.actor
+    if state.imitation is not None:
+        actor = {"actor": actor, "imitation": state.imitation, "critics": state.target_critics}
     noise = jnp.zeros_like(state.log_alpha) if average else jnp.ones_like(state.log_alpha)
-    return Policy(actor=state.average_actor if average else state.actor, scale=state.scale, noise=noise)
+    return Policy(actor=actor, scale=state.scale, noise=noise)
 
 
 def select_action(key: Array, policy: Policy, inputs: Array, config: TrainConfig, *, action_dim: int) -> Array:
-    """Actions (B, A) in [-1, 1] at inputs (B, input_dim), see `inputs.network_inputs`, with the policy's noise."""
-    distribution = apply_actor(policy.actor, inputs.T, config.agent, action_dim=action_dim)
-    return distribution.at(policy.noise * jax.random.normal(key, distribution.mean.shape))[0].T
+    """Actions (B, A) in [-1, 1] at inputs (B, input_dim), see `inputs.network_inputs`, with the policy's noise.
+
+    With `imitation_proposal` the critics choose, see `Policy.actor`.
+    """
+    proposes = config.imitation_proposal > 0
+    distribution = apply_actor(policy.actor["actor"] if proposes else policy.actor, inputs.T, config.agent, action_dim=action_dim)
+    action, _ = distribution.at(policy.noise * jax.random.normal(key, distribution.mean.shape))
+    if proposes:
+        action, _ = _better(action, policy.actor["imitation"], policy.actor["critics"], inputs.T, config)
+    return action.T
 
 
 class _Columns(struct.PyTreeNode, kw_only=True):
@@ -115,7 +128,7 @@ def update(key: Array, state: AgentState, batch: Transition, schedule: Schedule,
     Returns:
       The new agent and scalar metrics.
     """
-    blocks = num_blocks(batch.action.shape[0], max(config.agent.net_arch))
+    blocks = num_blocks(batch.action.shape[0], config.agent.widest_layer)
     columns, target_critics = _prepare(key, state, batch, config)
     gradient, critic_metrics = mean_over_blocks(functools.partial(_critic_gradient, state, target_critics, config), columns, blocks)
     critics, critic_optimiser = _descend(gradient, state.critic_optimiser, state.critics, config.agent.learning_rate)
@@ -165,14 +178,24 @@ def _prepare(key: Array, state: AgentState, batch: Transition, config: TrainConf
 def _targets(state: AgentState, target_critics: Params, config: TrainConfig, block: _Columns) -> Array:
     """What the critics of each column are moved towards: (M, B) target atoms, or (1, B) without quantiles."""
     next_action, log_prob = apply_actor(state.actor, block.next_inputs, config.agent, action_dim=block.action.shape[0]).at(block.next_noise)
+    entropy_bonus = -jnp.exp(state.log_alpha) * log_prob
+    if state.imitation is not None:
+        next_action, is_own = _better(next_action, state.imitation, target_critics, block.next_inputs, config)
+        entropy_bonus = jnp.where(is_own, entropy_bonus, 0.0)  # the imitating policy is not random
     next_atoms = apply_critics(target_critics, block.next_inputs, next_action, config.agent)  # (C, Q, B)
-    bellman = dict(reward=block.reward, discount=block.discount, entropy_bonus=-jnp.exp(state.log_alpha) * log_prob)
+    bellman = dict(reward=block.reward, discount=block.discount, entropy_bonus=entropy_bonus)
     if config.agent.base == "tqc":
         num_dropped = next_atoms.shape[0] * config.agent.top_quantiles_to_drop_per_net
         targets = target_atoms(next_atoms.reshape(-1, next_atoms.shape[-1]), **bellman, num_dropped=num_dropped)
     else:
         targets = target_value(next_atoms[:, 0], **bellman)
     return jnp.clip(targets, 0.0, 1.0) if config.agent.clip_targets else targets
+
+
+def _better(own: Array, imitation: Params, critics: Params, inputs: Array, config: TrainConfig) -> tuple[Array, Array]:
+    """Of the actor's actions (A, B) and the imitating policy's mean ones those that the critics value more, see `comparison.better`."""
+    actions = own, apply_actor(imitation, inputs, config.agent, action_dim=own.shape[0]).mode
+    return better(actions, (_value(critics, inputs, actions[0], config), _value(critics, inputs, actions[1], config)))
 
 
 def _critic_gradient(state: AgentState, target_critics: Params, config: TrainConfig, block: _Columns) -> tuple[Params, Metrics]:
@@ -196,6 +219,18 @@ def _value(critics: Params, inputs: Array, action: Array, config: TrainConfig) -
     return jnp.min(values, axis=0) if config.agent.num_target_critics is None else jnp.mean(values, axis=0)
 
 
+def _cloning_weight(critics: Params, block: _Columns, own_action: Array, config: TrainConfig) -> Array:
+    """How much of each column is cloned, (B,) in [0, 1]: of demonstrations, what the Q-filter passes."""
+    own_action = jax.lax.stop_gradient(own_action)
+    if config.agent.q_filter == "hard":
+        valued = _value(critics, block.inputs, block.action, config) > _value(critics, block.inputs, own_action, config)
+        return block.is_demonstration & valued
+    if config.agent.q_filter == "smooth":
+        values, own_values = (mean_returns(critics, block.inputs, action, config.agent) for action in (block.action, own_action))
+        return block.is_demonstration * probability_of_being_better(values, own_values)
+    return block.is_demonstration
+
+
 def _actor_gradient(state: AgentState, schedule: Schedule, config: TrainConfig, block: _Columns) -> tuple[Params, Metrics]:
     """The gradient of the actor's loss over a block, and metrics."""
     agent, quirks = config.agent, config.quirks
@@ -204,11 +239,8 @@ def _actor_gradient(state: AgentState, schedule: Schedule, config: TrainConfig, 
         distribution = apply_actor(actor, block.inputs, agent, action_dim=block.action.shape[0])
         action, log_prob = distribution.at(block.noise)
         value, entropy = jnp.mean(_value(state.critics, block.inputs, action, config)), -jnp.mean(log_prob)
-        clonable = block.is_demonstration
-        if agent.q_filter:
-            own = _value(state.critics, block.inputs, jax.lax.stop_gradient(distribution.mode), config)
-            clonable &= _value(state.critics, block.inputs, block.action, config) > own
-        bc = behaviour_cloning(distribution.mode if quirks.bc_action == "mean" else action, block.action, clonable, form=quirks.bc_loss)
+        weight = _cloning_weight(state.critics, block, distribution.mode, config)
+        bc = behaviour_cloning(distribution.mode if quirks.bc_action == "mean" else action, block.action, weight, form=quirks.bc_loss)
         total = -jnp.exp(state.log_alpha) * entropy - value + agent.bc_weight * bc
         return total, {"actor/loss": total, "actor/bc_loss": bc, "actor/value": value, "actor/entropy": entropy}
 

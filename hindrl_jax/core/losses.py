@@ -14,6 +14,7 @@ from hindrl_jax.base.types import Array
 from hindrl_jax.core import kernels
 
 _LEAST_SQUARED_LENGTH = 1e-3  # of actions; demonstrations that hardly do anything are not blown up
+_LEAST_WEIGHT = 1e-6  # of a batch, whose weights may all be 0
 
 
 def quantile_huber(quantiles: Array, targets: Array) -> Array:
@@ -78,26 +79,25 @@ def squared_error(values: Array, target: Array) -> Array:
     return 0.5 * jnp.square(values - jax.lax.stop_gradient(target).reshape((1,) * (values.ndim - 1) + target.shape))
 
 
-def behaviour_cloning(
-    policy_action: Array, demonstrated_action: Array, is_demonstration: Array, *, form: Literal["relative", "squared", "norm"]
-) -> Array:
+def behaviour_cloning(policy_action: Array, demonstrated_action: Array, weight: Array, *, form: Literal["relative", "squared", "norm"]) -> Array:
     """Behaviour cloning loss: masked by "is a demonstration row", divided by the whole batch (thesis eq. 2.32).
 
     Args:
       policy_action, demonstrated_action: (A, B) in [-1, 1].
-      is_demonstration: (B,) bool, the mask delta^e; of these, with a Q-filter, those that pass it.
+      weight: (B,) in [0, 1], how much of each row is cloned: the mask delta^e; with a Q-filter, those that pass it, or as far as they do.
       form: "squared" for the squared distance (thesis text), "norm" for the distance itself (original code), "relative" for the squared distance
-        over the mean squared length of the demonstrated actions: 1 for a policy that does nothing.
+        over the mean squared length of the demonstrated actions, weighted alike: 1 for a policy that does nothing.
 
     Returns:
       () loss.
     """
     squared = jnp.sum(jnp.square(policy_action - demonstrated_action), axis=0)
-    loss = jnp.mean(jnp.where(is_demonstration, jnp.sqrt(squared + 1e-12) if form == "norm" else squared, 0.0))
+    weight = weight.astype(squared.dtype)
+    loss = jnp.mean(weight * (jnp.sqrt(squared + 1e-12) if form == "norm" else squared))
     if form != "relative":
         return loss
-    length = jnp.where(is_demonstration, jnp.sum(jnp.square(demonstrated_action), axis=0), 0.0)
-    return loss / jnp.maximum(jnp.sum(length) / jnp.maximum(jnp.sum(is_demonstration), 1), _LEAST_SQUARED_LENGTH)
+    length = jnp.sum(weight * jnp.sum(jnp.square(demonstrated_action), axis=0)) / jnp.maximum(jnp.sum(weight), _LEAST_WEIGHT)
+    return loss / jnp.maximum(length, _LEAST_SQUARED_LENGTH)
 
 
 def entropy_coefficient(log_alpha: Array, log_prob: Array, *, target_entropy: Array | float) -> Array:

@@ -14,7 +14,7 @@ from flax import linen as nn
 from flax import struct
 
 from hindrl_jax.base.types import Array
-from hindrl_jax.config import AgentConfig
+from hindrl_jax.config import RESIDUAL_EXPANSION, AgentConfig
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 _KERNEL_INIT = nn.initializers.variance_scaling(1.0 / 3.0, "fan_in", "uniform")  # U(-b, b), b = 1 / sqrt(fan_in), as in the thesis's framework
@@ -46,9 +46,32 @@ class MLP(nn.Module):
         for width in self.net_arch:
             features = Dense(width)(features)
             if self.layer_norm:
-                features = nn.LayerNorm(reduction_axes=0, feature_axes=0)(features)
+                features = _layer_norm()(features)
             features = nn.relu(features)
         return Dense(self.out_dim)(features)
+
+
+class ResidualMLP(nn.Module):
+    """Residual network of SimBa (Lee et al., 2024): (in, B) -> (out_dim, B).
+
+    An embedding, then a block x + W2 relu(W1 LN(x)) for each entry of `net_arch`, four times as wide inside, then layer normalisation. Difference
+    from the paper: inputs are scaled by the demonstrations (`inputs`), not by running statistics.
+    """
+
+    net_arch: tuple[int, ...]
+    out_dim: int
+
+    @nn.compact
+    def __call__(self, features: Array) -> Array:
+        features = Dense(self.net_arch[0])(features)
+        for width in self.net_arch:
+            inner = nn.relu(Dense(RESIDUAL_EXPANSION * width)(_layer_norm()(features)))
+            features = features + Dense(width)(inner)
+        return Dense(self.out_dim)(_layer_norm()(features))
+
+
+def _layer_norm() -> nn.LayerNorm:
+    return nn.LayerNorm(reduction_axes=0, feature_axes=0)
 
 
 class ActionDistribution(struct.PyTreeNode, kw_only=True):
@@ -75,12 +98,18 @@ class ActionDistribution(struct.PyTreeNode, kw_only=True):
         return jnp.tanh(pre_tanh), jnp.sum(log_prob - log_slope, axis=0)
 
 
-def _actor(config: AgentConfig, action_dim: int) -> MLP:
-    return MLP(net_arch=config.net_arch, out_dim=2 * action_dim)
+def _actor(config: AgentConfig, action_dim: int) -> nn.Module:
+    return _network(config, 2 * action_dim, layer_norm=False)
 
 
-def _critic(config: AgentConfig, out_dim: int) -> MLP:
-    return MLP(net_arch=config.net_arch, out_dim=out_dim, layer_norm=config.layer_norm)
+def _critic(config: AgentConfig, out_dim: int) -> nn.Module:
+    return _network(config, out_dim, layer_norm=config.layer_norm)
+
+
+def _network(config: AgentConfig, out_dim: int, *, layer_norm: bool) -> nn.Module:
+    if config.residual:
+        return ResidualMLP(net_arch=config.net_arch, out_dim=out_dim)
+    return MLP(net_arch=config.net_arch, out_dim=out_dim, layer_norm=layer_norm)
 
 
 def init_actor(key: Array, config: AgentConfig, *, input_dim: int, action_dim: int) -> Params:
@@ -119,8 +148,14 @@ def apply_critics(params: Params, inputs: Array, action: Array, config: AgentCon
 
 
 def mean_return(params: Params, inputs: Array, action: Array, config: AgentConfig) -> Array:
-    """Mean over critics and quantiles of `apply_critics`, (B,), in less work: the last layer is linear, so its kernel is averaged instead."""
-    last = f"Dense_{len(config.net_arch)}"
+    """Mean over critics and quantiles of `apply_critics`: (B,)."""
+    return jnp.mean(mean_returns(params, inputs, action, config), axis=0)
+
+
+def mean_returns(params: Params, inputs: Array, action: Array, config: AgentConfig) -> Array:
+    """Mean over the quantiles of `apply_critics`, (C, B), in less work: the last layer is linear, so its kernel is averaged instead."""
+    num_hidden = 2 * len(config.net_arch) + 1 if config.residual else len(config.net_arch)
+    last = f"Dense_{num_hidden}"
     output = jax.tree.map(lambda leaf: jnp.mean(leaf, axis=-1, keepdims=True), params["params"][last])
     averaged = {"params": {**params["params"], last: output}}
-    return jnp.mean(_apply_each(averaged, inputs, action, config, 1), axis=(0, 1))
+    return _apply_each(averaged, inputs, action, config, 1)[:, 0]

@@ -11,6 +11,8 @@ from flax import struct
 
 from hindrl_jax.base.environments import Restorable, Steppable, action_to_env
 from hindrl_jax.base.types import Array, TimeStep, tree_where
+from hindrl_jax.core import curriculum
+from hindrl_jax.core.curriculum import Curriculum, Origin
 from hindrl_jax.core.goals import GoalTable, sample_goals
 from hindrl_jax.core.randomness import uniform_in_groups
 
@@ -25,6 +27,7 @@ class RolloutState(struct.PyTreeNode, kw_only=True):
     observation: Array  # (E, D)
     desired_goal: Array  # (E, G), the behavioural goals
     notes: dict[str, Array]  # leaves (E,), what the replay is to note of each transition of the episode, by name; most runs note nothing
+    origin: Origin | None = None  # where the episodes began; None where none begins in a demonstrated state
 
 
 class StartTable(struct.PyTreeNode, kw_only=True):
@@ -34,21 +37,10 @@ class StartTable(struct.PyTreeNode, kw_only=True):
     lengths: Array  # (N,) int32, number of transitions
 
 
-def sample_starts(key: Array, table: StartTable, num_starts: int, *, share: Array | float = 1.0) -> Array:
-    """Draws states uniformly from the last `share` of each demonstration, of which at least one state is left.
-
-    Args:
-      key: random key.
-      table: N demonstrations.
-      num_starts: how many to draw.
-      share: () in [0, 1].
-
-    Returns:
-      (num_starts, S).
-    """
-    eligible = jnp.clip(jnp.ceil(share * table.lengths).astype(jnp.int32), 1, table.lengths)
-    demo, steps_left = uniform_in_groups(key, num_starts, eligible)
-    return table.states[demo, table.lengths[demo] - steps_left]
+def sample_starts(key: Array, table: StartTable, num_starts: int) -> Origin:
+    """Draws uniformly from all states of N demonstrations but the last ones."""
+    demo, steps_left = uniform_in_groups(key, num_starts, table.lengths)
+    return Origin(demo=demo, step=table.lengths[demo] - steps_left)
 
 
 class DemoResets(NamedTuple):
@@ -57,8 +49,8 @@ class DemoResets(NamedTuple):
     starts: StartTable
     ratio: float
     """The probability with which one does."""
-    share: Array | float
-    """The share of each demonstration, up to its end, that its states are drawn from."""
+    curriculum: Curriculum | None = None
+    """Where in the demonstrations; None draws from all of their states."""
 
 
 def reset(key: Array, env: Steppable, behavioural_goals: GoalTable, num_envs: int, demo_resets: DemoResets | None = None) -> RolloutState:
@@ -73,20 +65,33 @@ def reset(key: Array, env: Steppable, behavioural_goals: GoalTable, num_envs: in
     """
     key_env, key_goal = jax.random.split(key)
     env_state, observation = jax.vmap(env.reset)(jax.random.split(key_env, num_envs))
+    origin = None
     if demo_resets is not None:
         restorable = cast(Restorable, env)
         key_choice, key_start, key_states = jax.random.split(jax.random.fold_in(key, 2), 3)  # 2: split has used what 0 and 1 give
-        vectors = sample_starts(key_start, demo_resets.starts, num_envs, share=demo_resets.share)
+        origin, vectors = _demonstrated_starts(key_start, demo_resets, num_envs)
         demonstrated = jax.vmap(restorable.vector_to_state)(jax.random.split(key_states, num_envs), vectors)
         chosen = jax.random.bernoulli(key_choice, demo_resets.ratio, (num_envs,))
         env_state = tree_where(chosen, demonstrated, env_state)
         observation = jax.vmap(restorable.observe)(env_state)
+        origin = origin.replace(demo=jnp.where(chosen, origin.demo, -1))
     return RolloutState(
         env_state=env_state,
         observation=observation,
         desired_goal=sample_goals(key_goal, behavioural_goals, num_envs),
         notes={},
+        origin=origin,
     )
+
+
+def _demonstrated_starts(key: Array, demo_resets: DemoResets, num_envs: int) -> tuple[Origin, Array]:
+    """Where in the demonstrations episodes begin, and the states there, as vectors (E, S)."""
+    starts = demo_resets.starts
+    if demo_resets.curriculum is None:
+        origin = sample_starts(key, starts, num_envs)
+    else:
+        origin = curriculum.sample(key, demo_resets.curriculum, starts.lengths, num_envs)
+    return origin, starts.states[origin.demo, origin.step]
 
 
 def step(rollout: RolloutState, restarted: RolloutState, action: Array, env: Steppable) -> tuple[RolloutState, TimeStep]:

@@ -17,9 +17,10 @@ from hindrl_jax.base.environments import Environment, Steppable
 from hindrl_jax.base.types import Array, TimeStep, Transition, tree_where
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.core import agent as agents
-from hindrl_jax.core import replay, rollout
+from hindrl_jax.core import curriculum, replay, rollout
 from hindrl_jax.core.agent import AgentState, Metrics, Policy
 from hindrl_jax.core.batch import REWARDED_BY_GOAL, goal_test, sample_batch, sample_demonstrations
+from hindrl_jax.core.curriculum import Curriculum
 from hindrl_jax.core.goals import nearby_goal
 from hindrl_jax.core.guidance import Guidance
 from hindrl_jax.core.hindsight import NEARBY_GOAL, hindsight_steps
@@ -36,6 +37,7 @@ class TrainState(struct.PyTreeNode, kw_only=True):
     replay: ReplayState
     rollout: RolloutState
     sampler: Any  # what the `Sampler` keeps; nothing for the uniform one
+    curriculum: Curriculum | None = None  # how far back in the demonstrations episodes begin; None without `demo_reset_curriculum`
     key: Array
     env_steps: Array  # () int32
     updates: Array  # () int32
@@ -85,14 +87,16 @@ def init(
     capacity = config.buffer_size if config.learns_from_rollouts else 2 * config.num_envs * env.horizon  # the smallest one
     notes: dict[str, int] = {NEARBY_GOAL: -1} if config.batch.uses_intersections else {}
     notes |= {REWARDED_BY_GOAL: False} if config.goal.has_achieved_goals else {}
+    begins = curriculum.init(guidance.starts.lengths) if config.demo_reset_curriculum else None
     if begun is None:
-        begun = _new_episodes(key_rollout, guidance, cast(Steppable, env), config, 0.0)
+        begun = _new_episodes(key_rollout, guidance, cast(Steppable, env), config, begins)
     empty = replay.init(env, num_envs=config.num_envs, capacity=capacity, notes=notes)
     return TrainState(
         agent=agents.init(key_agent, guidance.scale, config, action_dim=env.action_dim),
         replay=empty,
         rollout=_with_notes(begun, config),
         sampler=() if sampler is None else sampler.init(guidance, empty),
+        curriculum=begins,
         key=key_train,
         env_steps=jnp.zeros((), jnp.int32),
         updates=jnp.zeros((), jnp.int32),
@@ -101,11 +105,10 @@ def init(
     )
 
 
-def _new_episodes(key: Array, guidance: Guidance, env: Steppable, config: TrainConfig, progress: Array | float) -> RolloutState:
+def _new_episodes(key: Array, guidance: Guidance, env: Steppable, config: TrainConfig, begins: Curriculum | None) -> RolloutState:
     demo_resets = None
     if guidance.starts is not None:
-        share = jnp.minimum(progress / config.demo_reset_curriculum, 1.0) if config.demo_reset_curriculum > 0.0 else 1.0
-        demo_resets = DemoResets(starts=guidance.starts, ratio=config.demo_reset_ratio, share=share)
+        demo_resets = DemoResets(starts=guidance.starts, ratio=config.demo_reset_ratio, curriculum=begins)
     return rollout.reset(key, env, guidance.behavioural_goals, config.num_envs, demo_resets)
 
 
@@ -147,7 +150,7 @@ def _reset_agent_if_due(state: TrainState, env: Environment, config: TrainConfig
     key, key_agent = jax.random.split(state.key)
     due, anew = passed > state.resets, agents.init(key_agent, state.agent.scale, config, action_dim=env.action_dim)
     return state.replace(
-        agent=tree_where(due, anew, state.agent),
+        agent=tree_where(due, anew.replace(imitation=state.agent.imitation), state.agent),
         key=key,
         resets=passed,
         updates_at_reset=jnp.where(due, state.updates, state.updates_at_reset),
@@ -183,8 +186,11 @@ def _interact(key: Array, state: TrainState, guidance: Guidance, env: Steppable,
     key_act, key_reset, key_goals, key_nearby = jax.random.split(key, 4)
     before = state.rollout
     action = act(key_act, before.observation, before.desired_goal)
-    begun = _with_notes(_new_episodes(key_reset, guidance, env, config, _progress(state, config)), config)
+    begun = _with_notes(_new_episodes(key_reset, guidance, env, config, state.curriculum), config)
     after, time_step = rollout.step(before, begun, action, env)
+    if state.curriculum is not None:
+        ended = time_step.terminated | time_step.truncated
+        state = state.replace(curriculum=curriculum.record(state.curriculum, before.origin, ended, time_step.reward > 0.0))
     state = record(key_nearby, state, (action, time_step), guidance, env, config)
     return continue_from(key_goals, state, after, time_step, env, config)
 
@@ -290,6 +296,13 @@ def clone(state: TrainState, guidance: Guidance, *, env: Environment, config: Tr
 
     state, metrics = jax.lax.scan(gradient_step, state, length=num_iterations)
     return state, jax.tree.map(jnp.mean, metrics)
+
+
+def imitate(state: TrainState, guidance: Guidance, *, env: Environment, config: TrainConfig) -> TrainState:
+    """Clones the policy that proposes actions beside the actor, by `imitation_proposal` gradient steps; all else stays as it is."""
+    key, key_clone = jax.random.split(state.key)
+    clone_of, _ = clone(state.replace(key=key_clone), guidance, env=env, config=config, num_iterations=config.imitation_proposal)
+    return state.replace(key=key, agent=state.agent.replace(imitation=clone_of.agent.actor))
 
 
 def evaluate(key: Array, policy: Policy, guidance: Guidance, *, env: Steppable, config: TrainConfig, num_episodes: int) -> Evaluation:

@@ -22,6 +22,7 @@ from flax.traverse_util import flatten_dict
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.files import disk_trouble, why_unwritable, write_text_atomically
 from hindrl_jax.base.steppers import Watchable
+from hindrl_jax.core.agent import policy
 from hindrl_jax.plotting import curves as plots
 from hindrl_jax.runs.reader import load_run
 from hindrl_jax.runs.reporter import Reporter
@@ -191,7 +192,7 @@ def _save_parameters(path: Path, result: Result) -> None:
     tree = {
         "policy": result.returned.actor,
         "policy_noise": np.asarray(result.returned.noise, np.float32),
-        "last_policy": agent.average_actor,
+        "last_policy": policy(agent, average=True).actor,
         "actor": agent.actor,
         "critics": agent.critics,
         "log_alpha": agent.log_alpha,

@@ -66,6 +66,8 @@ def check_config(env: Environment, config: TrainConfig) -> None:
         raise UserError(f"{name} cannot begin in demonstrated states: it has no {missing}: set demo_reset_ratio to 0")
     if not in_jax and config.agent_resets:
         raise UserError(f"agent_resets = {config.agent_resets} needs a step in JAX, which {name} does not have: set it to ()")
+    if not in_jax and config.action_chunks:
+        raise UserError(f"action_chunks = True needs a step in JAX, which {name} does not have: set it to False, and each action is held")
 
 
 def steps_to_learn(env: Environment, config: TrainConfig) -> int:

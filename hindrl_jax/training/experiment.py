@@ -81,12 +81,12 @@ def fit(
         tables = tables.replace(states=None)  # nobody needs them on the devices
 
     num_held = config.num_held
-    tables = hold_demonstrations(tables, num_held)
+    tables = hold_demonstrations(tables, num_held, chunks=config.action_chunks)
     if config.quirks.misaligned_demo_actions and int(tables.lengths.min()) < 2:
         raise UserError("misaligned_demo_actions needs demonstrations of at least 2 steps: turn it off or record others")
     started = time.perf_counter()
-    with contextlib.closing(programs_of(hold(env, num_held), configs, tables)) as programs:
-        kept = nothing_kept(programs.shapes["state"].agent.average_actor)
+    with contextlib.closing(programs_of(hold(env, num_held, chunks=config.action_chunks), configs, tables)) as programs:
+        kept = nothing_kept(policy(programs.shapes["state"].agent, average=True).actor)
         result = Result(env=env, configs=configs, seeds=tuple(seeds), **programs.shapes, kept=kept, rows=[], compile_seconds=0.0)
         restored = restore(result)
         seeds_on_devices, tables = spread((np.asarray(seeds, np.uint32), tables), programs.mesh)
@@ -123,7 +123,7 @@ def _train(result: Result, programs: Programs, report: Report) -> None:
     if begins and config.learns_from_rollouts:
         result.state = jax.block_until_ready(programs.collect(result.state, result.guidance))
         result.env_steps = programs.steps_at_random
-        if config.bc_warm_start > 0:
+        if config.clones_first:
             result.state = jax.block_until_ready(programs.warm_start(result.state, result.guidance))
             result.updates = config.bc_warm_start
     ends = result.kept.all_confirmed
@@ -176,13 +176,13 @@ def _with_noise(policies: Policy, noise: np.ndarray, programs: Programs) -> Poli
 
 def _finish(result: Result, programs: Programs) -> None:
     """Chooses the policies that are returned."""
-    scale = result.state.agent.scale
+    scale, last_policy = result.state.agent.scale, policy(result.state.agent, average=True)
 
     def play(actor: Any, noise: np.ndarray) -> Evaluation:
         of_runs: dict[str, Any] = spread(dict(actor=actor, noise=noise.astype(np.float32)), programs.mesh)
         return _played(result, programs, Policy(scale=scale, **of_runs), FRESH_EPISODES)
 
-    result.returned, last = choose(result.kept, gather(result.state.agent.average_actor), result.moment, play)
+    result.returned, last = choose(result.kept, gather(last_policy.actor), result.moment, play)
     result.final_success, result.final_length = (np.asarray(outcome).mean(axis=1) for outcome in (last.success, last.length))
     if jax.process_count() > 1:
         result.guidance, agent = gather((result.guidance, result.state.agent))

@@ -92,7 +92,7 @@ class HostPrograms(Programs):
                 pending["remember"] = compile_(self._trace(remember, state, plan, (step, begun), *rest, donate=True))
                 pending["decide"] = compile_(deciding)
                 pending["decide_at_random"] = compile_(self._trace(decide, *planning, at_random=True))
-            if config.bc_warm_start > 0:
+            if config.clones_first:
                 pending["warm_start"] = compile_(self._trace(warm_start, state, *rest, donate=True))
             self._programs = {name: program.result() for name, program in pending.items()}
 

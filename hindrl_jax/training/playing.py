@@ -11,7 +11,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hindrl_jax.base.environments import Environment, RestorableEnvironment, Steppable, action_from_env, action_to_env, can_step, compiler_options
+from hindrl_jax.base.environments import (
+    Environment,
+    RestorableEnvironment,
+    Steppable,
+    action_from_env,
+    action_to_env,
+    can_step,
+    command_of,
+    compiler_options,
+)
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.steppers import HostStepped, Watchable, can_step_on_host
 from hindrl_jax.base.types import Array, Episodes, tree_where
@@ -37,26 +46,28 @@ def play(key: Array, env: RestorableEnvironment, act: Act, num_episodes: int, nu
       env: static.
       act: the policy.
       num_episodes: N, played side by side.
-      num_held: steps for which each action is held.
+      num_held: steps for which each action is held, or actions in what `act` returns.
     """
 
     def step(carry: tuple[Array, Any, Array, Array, Array], index: Array) -> tuple[tuple[Array, Any, Array, Array, Array], tuple[Array, ...]]:
         key, state, observation, over, held = carry
         key, key_act = jax.random.split(key)
-        action = act(key_act, state, observation)
+        decision = act(key_act, state, observation)
         if num_held > 1:
-            action = jnp.where(index % num_held == 0, action, held)
+            decision = jnp.where(index % num_held == 0, decision, held)
+        action = command_of(decision, index % num_held, env.action_dim)
         next_state, time_step = env.step(state, action)
         next_state = tree_where(over, state, next_state)
         next_observation = jnp.where(over, observation, time_step.observation)
         done = jnp.clip(action_from_env(action, env), -1.0, 1.0)  # what the environment makes of an action beyond its bounds
         row = (observation, env.state_to_vector(state), done, time_step.reward, over, time_step.terminated)
-        return (key, next_state, next_observation, over | time_step.terminated | time_step.truncated, action), row
+        return (key, next_state, next_observation, over | time_step.terminated | time_step.truncated, decision), row
 
     def episode(key: Array) -> Episodes:
         key_reset, key_play = jax.random.split(key)
         state, observation = env.reset(key_reset)
-        start = (key_play, state, observation, jnp.asarray(False), jnp.zeros(env.action_dim))
+        nothing = jnp.zeros(jax.eval_shape(act, key_play, state, observation).shape)
+        start = (key_play, state, observation, jnp.asarray(False), nothing)
         (_, state, observation, _, _), rows = jax.lax.scan(step, start, jnp.arange(env.horizon))
         observations, states, actions, rewards, over, terminated = rows
         return Episodes(
@@ -111,6 +122,11 @@ class TrainedPolicies:
         """Steps for which each action is held."""
         return self.config.num_held
 
+    @property
+    def _decisions(self) -> Environment:
+        """The environment as the policies see it, one step of which is one decision."""
+        return hold(self.env, self.num_held, chunks=self.config.action_chunks)
+
     def evaluate(self, keys: Array, num_episodes: int, report: Callable[[int], None] = lambda played: None) -> Evaluation:
         """Plays fresh episodes with each policy; leaves (S, num_episodes).
 
@@ -119,7 +135,7 @@ class TrainedPolicies:
           num_episodes: of each policy.
           report: called with the number of episodes played so far, all policies together, where they are played one by one.
         """
-        env = hold(self.env, self.num_held)
+        env = self._decisions
         if can_step(env):
             return jax.device_get(in_control_steps(self._evaluate_in_jax(env, keys, num_episodes), self.env, self.num_held))
         if can_step_on_host(env):
@@ -136,7 +152,7 @@ class TrainedPolicies:
 
     def player(self, index: int, num_episodes: int, *, any_goal: bool = False) -> Callable[[Array], Episodes]:
         """`player` of one policy. It aims at the first behavioural goal, or with `any_goal` at one drawn for the episode."""
-        env = self.env
+        env = self._decisions
         policy, goals = jax.tree.map(lambda leaf: leaf[index], (self.policies, self.behavioural_goals))
         choose = make_policy(policy, env, self.config)
 
@@ -145,7 +161,7 @@ class TrainedPolicies:
             goal = sample_goals(jax.random.fold_in(state.key, 0), goals, 1) if any_goal else goals.goals[:1]
             return action_to_env(choose(key, observation[None], goal)[0], env)
 
-        return player(env, act, num_episodes, self.num_held)
+        return player(self.env, act, num_episodes, self.num_held)
 
     def film(self, keys: Array, index: int) -> tuple[list[np.ndarray], int]:
         """Plays episodes in an environment that draws itself: pictures (H, W, 3) uint8 of all states, and how many episodes are solved.

@@ -86,7 +86,7 @@ class Programs(abc.ABC):
 
     @abc.abstractmethod
     def warm_start(self, state: TrainState, guidance: Guidance) -> TrainState:
-        """`bc_warm_start` gradient steps of behaviour cloning; the state is donated."""
+        """The gradient steps of behaviour cloning by `imitation_proposal` and `bc_warm_start`; the state is donated."""
 
     @abc.abstractmethod
     def learn(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, Metrics]:
@@ -156,7 +156,7 @@ class JaxPrograms(Programs):
                 pending[f"evaluate {num_episodes}"] = compile_(self._trace(evaluate, key, actor, *rest, num_episodes=num_episodes))
             if config.learns_from_rollouts:
                 pending["collect"] = compile_(self._trace(collect, state, *rest, donate=True, num_iterations=self.warm_up), **_RUN_ONCE)
-            if config.bc_warm_start > 0:
+            if config.clones_first:
                 pending["warm_start"] = compile_(self._trace(warm_start, state, *rest, donate=True))
             self._programs = {name: program.result() for name, program in pending.items()}
 
@@ -210,7 +210,11 @@ def learn(state: TrainState, guidance: Guidance, *, env: Steppable, config: Trai
 
 def warm_start(state: TrainState, guidance: Guidance, *, env: Environment, config: TrainConfig) -> TrainState:
     """The behaviour cloning before the first gradient step of reinforcement learning."""
-    return training.clone(state, guidance, env=env, config=config, num_iterations=config.bc_warm_start)[0]
+    if config.imitation_proposal > 0:
+        state = training.imitate(state, guidance, env=env, config=config)
+    if config.bc_warm_start > 0:
+        state, _ = training.clone(state, guidance, env=env, config=config, num_iterations=config.bc_warm_start)
+    return state
 
 
 def evaluate(key: Array, policy: Policy, guidance: Guidance, *, env: Steppable, config: TrainConfig, num_episodes: int) -> tuple[Array, Evaluation]:

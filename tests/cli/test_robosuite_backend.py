@@ -159,7 +159,7 @@ def run(arm, tmp_path_factory):
 
 
 def test_evaluation_in_robosuite(run, capsys):
-    cli.main(["eval", str(run), "--backend", "robosuite", "--episodes", "2", "--stochastic"])
+    cli.main(["eval", str(run), "--backend", "robosuite", "--episodes", "2", "--noise", "1"])
     printed = capsys.readouterr().out
     assert "FixedParameterizedReach in robosuite, 2 episodes per seed" in printed
     played = []
@@ -195,7 +195,7 @@ def test_each_seed_plays_its_own_policy_towards_one_of_its_goals_per_episode(run
     observation = env.reset(jax.random.key(0))[1][None]
     for seed in range(2):
         policy_of_seed, table = jax.tree.map(lambda leaf, seed=seed: leaf[seed], (loaded.policies, loaded.behavioural_goals))
-        policy = make_policy(policy_of_seed, env, config, stochastic=False)
+        policy = make_policy(policy_of_seed.replace(noise=0.0), env, config)
         possible = [np.asarray(action_to_env(policy(jax.random.key(0), observation, goal[None])[0], env)) for goal in table.goals]
         chosen = set()
         for actions in acted[4 * seed : 4 * seed + 4]:

@@ -6,14 +6,16 @@ import re
 import shlex
 import warnings
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from commands import refusal
 
 from hindrl_jax import cli
 from hindrl_jax.cli.train_options import parse_train
+from hindrl_jax.config import Algorithm
 from hindrl_jax.runs.spec import read_spec
-from hindrl_jax.tasks.presets import preset
+from hindrl_jax.tasks.presets import Preset, preset
 from hindrl_jax.tasks.registry import make
 
 
@@ -72,8 +74,10 @@ def test_flags_of_each_type():
     assert (spec.config.agent.target_entropy, spec.config.batch.reach_zero, spec.env.num_objects) == (-2.5, None, 3)
 
 
-@pytest.mark.parametrize("algo", ["bc", "tqcfd", "hindrl", "smooth-hindrl"])
-@pytest.mark.parametrize("preset", ["default", "thesis", "original"])
+PRESETS = [(algo, preset) for algo in get_args(Algorithm) for preset in get_args(Preset) if (algo, preset) != ("bc", "rlpd")]
+
+
+@pytest.mark.parametrize(("algo", "preset"), PRESETS)
 def test_presets_parse_and_survive_the_configuration_file(algo, preset, tmp_path):
     spec, _ = parse_train(["--algo", algo, "--preset", preset])
     path = tmp_path / "config.json"

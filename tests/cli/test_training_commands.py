@@ -168,7 +168,7 @@ def test_a_place_inside_a_file_is_refused(tmp_path, capsys):
 
 
 def test_eval_and_render_read_the_run_back(run, tmp_path, capsys):
-    cli.main(["eval", str(run), "--episodes", "4", "--stochastic"])
+    cli.main(["eval", str(run), "--episodes", "4", "--noise", "1"])
     assert "4 episodes per seed" in capsys.readouterr().out
     cli.main(["eval", str(run), "--episodes", "2", "--last"])
     assert "2 episodes per seed" in capsys.readouterr().out

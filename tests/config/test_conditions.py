@@ -47,6 +47,7 @@ OF_THE_HOST = {
     "eval_every": "how many iterations are run between evaluations",
     "eval_episodes": "how many episodes an evaluation plays; it does not lead back to the policy",
     "stop_at": "ends the run",
+    "action_chunks": "as action_hold",
     "action_hold": "the programs are given another environment and other demonstrations, and count steps by it",
 }
 
@@ -56,8 +57,9 @@ VALUES = {
     "updates_per_iteration": (2, 1),
     "learning_starts": (30, 20),
     "demo_reset_ratio": (0.5, 0.25),
-    "demo_reset_curriculum": (0.5, 0.25),
+    "demo_reset_curriculum": (True, False),
     "bc_warm_start": (2, 3),
+    "imitation_proposal": (2, 3),
     "agent_resets": ((0.5,), (0.25,)),
     "buffer_size": (60, 40),
     "batch_size": (16, 8),
@@ -78,6 +80,7 @@ VALUES = {
     "base": ("sac", "tqc"),
     "net_arch": ((5,), (4,)),
     "layer_norm": (True, False),
+    "residual": (True, False),
     "learning_rate": (1e-2, 1e-4),
     "clip_targets": (True, False),
     "num_critics": (3, 2),
@@ -90,7 +93,7 @@ VALUES = {
     "target_entropy": (-3.0, -5.0),
     "final_target_entropy": (-4.0, -5.0),
     "bc_weight": (0.1, 0.2),
-    "q_filter": (True, False),
+    "q_filter": ("hard", "smooth"),
     "input_encoding": ("raw", "multiscale"),
     "priority_exponent": (0.5, 0.6),
     "importance_exponent": (0.6, 0.7),
@@ -161,13 +164,14 @@ BASES = {
         "smooth-hindrl with sac": dict(algo="smooth-hindrl", epsilon_filtering=True, epsilon_steps=1, base="sac", demo_reset_ratio=0.5),
         "joint_union with sac and one critic": dict(hindrl_sampling_strategy="joint_union", base="sac", num_critics=1),
         "joint_intersection": dict(hindrl_sampling_strategy="joint_intersection"),
-        "future with redq": dict(hindrl_sampling_strategy="future", num_critics=3, num_target_critics=2, epsilon=0.1),
+        "future with redq, residual": dict(hindrl_sampling_strategy="future", residual=True, num_critics=3, num_target_critics=2, epsilon=0.1),
         "the other joint_intersection with priorities": dict(
             hindrl_sampling_strategy="joint_intersection", intersection_goals="demonstrations", priority_exponent=0.5
         ),
         "no relabelling": dict(relabelled_per_original=0.0, final_target_entropy=None),
         "no demonstration rows": dict(max_demo_ratio=0.0),
         "no demonstration rows, a warm start": dict(max_demo_ratio=0.0, bc_warm_start=1),
+        "no demonstration rows, proposals of a clone": dict(max_demo_ratio=0.0, imitation_proposal=1),
         "no cloning": dict(bc_weight=0.0, agent_resets=(0.4,)),
     }.items()
 }

@@ -13,6 +13,7 @@ from hindrl_jax.config.sweeps import SWEEPABLE
 from hindrl_jax.core import agent, train
 from hindrl_jax.core.guidance import guidance
 from hindrl_jax.training.prioritised import sampler_for
+from hindrl_jax.training.programs import warm_start
 
 ENV, DEMONSTRATIONS = Corridor(), corridor_demonstrations()
 
@@ -43,7 +44,7 @@ class Stages:
         return train.collect(state, data, **self.given(values), num_iterations=train.warm_up_iterations(ENV, self.config)), data
 
     def warm_up(self, values, state, data):
-        return train.clone(state, data, **self.without_sampler(values), num_iterations=self.config.bc_warm_start)[0], data
+        return warm_start(state, data, **self.without_sampler(values)), data
 
     def without_sampler(self, values):
         return {name: value for name, value in self.given(values).items() if name != "sampler"}
@@ -67,12 +68,12 @@ class Stages:
         if not self.config.learns_from_rollouts:
             return self.clone(values, *carry)
         carry = self.collect(values, *carry)
-        return self.learn(values, *(self.warm_up(values, *carry) if self.config.bc_warm_start else carry))
+        return self.learn(values, *(self.warm_up(values, *carry) if self.config.clones_first else carry))
 
     def parts(self):
         """Most of the same, in parts."""
         names = ("take", "begin", "clone") if not self.config.learns_from_rollouts else ("take", "begin", "collect", "warm_up", "draw", "descend")
-        return {name: getattr(self, name) for name in names if name != "warm_up" or self.config.bc_warm_start}
+        return {name: getattr(self, name) for name in names if name != "warm_up" or self.config.clones_first}
 
 
 class Traced:

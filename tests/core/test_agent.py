@@ -76,11 +76,11 @@ def test_behaviour_cloning_follows_demonstrations_alone(bc_loss, bc_action):
 
 @pytest.mark.parametrize("rises", [True, False])
 def test_entropy_coefficient_moves_towards_minus_the_action_dimensions(rises):
-    # The default target is -1 here. A fresh policy has an entropy near log 2; with log_std lowered by 5 it is near -3.6.
+    # The target is -1 here. A fresh policy has an entropy near log 2; with log_std lowered by 5 it is near -3.6.
     start = fresh_agent(jax.random.key(5)).replace(log_alpha=jnp.asarray(np.log(0.5), jnp.float32))
     start.actor["params"]["Dense_1"]["bias"] = jnp.array([0.0, -5.0 if rises else 0.0])
     batch = make_batch(action=ACTIONS, reward=0.0, discount=0.0)
-    states, metrics = train(5, batch, with_agent(target_entropy=None), start)
+    states, metrics = train(5, batch, with_agent(target_entropy=-1.0), start)
     alphas = np.append(0.5, np.exp(states.log_alpha[:10]))
     np.testing.assert_allclose(metrics["alpha/value"][:11], alphas, rtol=1e-5)
     # Adam's steps are one learning rate long in log alpha while the gradient keeps its sign.
@@ -134,11 +134,12 @@ def test_actions_by_hand():
     actor = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes)
     actor["params"]["Dense_1"]["bias"] = jnp.array([0.5, -1.0, np.log(0.1), np.log(2.0)])  # means, and logarithms of the deviations
     mode, sampled = (
-        agents.select_action(jax.random.key(1), actor, jnp.ones((3, 3)), CONFIG, action_dim=2, stochastic=stochastic) for stochastic in (False, True)
+        agents.select_action(jax.random.key(1), agents.Policy(actor=actor, scale=UNIT_SCALE, noise=noise), jnp.ones((3, 3)), CONFIG, action_dim=2)
+        for noise in (0.0, 0.5)
     )
     np.testing.assert_allclose(mode, np.tanh([[0.5, -1.0]] * 3), atol=1e-6)
     noise = np.asarray(jax.random.normal(jax.random.key(1), (2, 3))).T  # one column per row of the batch
-    np.testing.assert_allclose(sampled, np.tanh([0.5, -1.0] + np.array([0.1, 2.0]) * noise), atol=1e-6)
+    np.testing.assert_allclose(sampled, np.tanh([0.5, -1.0] + 0.5 * np.array([0.1, 2.0]) * noise), atol=1e-6)
 
 
 def test_initial_alpha():
@@ -207,8 +208,8 @@ def test_update_bc_by_hand(bc_loss, bc_action, expected, slope):
 
 def test_policy_is_the_actor_or_its_average_with_the_scale():
     state = fresh_agent(jax.random.key(0)).replace(average_actor="average", actor="actor")
-    assert agents.policy(state, average=False) == agents.Policy(actor="actor", scale=state.scale)
-    assert agents.policy(state, average=True) == agents.Policy(actor="average", scale=state.scale)
+    assert agents.policy(state, average=False) == agents.Policy(actor="actor", scale=state.scale, noise=1.0)
+    assert agents.policy(state, average=True) == agents.Policy(actor="average", scale=state.scale, noise=0.0)
 
 
 def test_networks_see_both_ends_of_a_transition_at_its_goal():

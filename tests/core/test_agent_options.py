@@ -22,6 +22,7 @@ from probe import (
     with_constant_critics,
 )
 
+from hindrl_jax.config import AgentConfig
 from hindrl_jax.core import agent as agents
 
 BASES = {"tqc": CONFIG, "sac": with_agent(base="sac")}
@@ -32,6 +33,13 @@ def with_constant_action(actor, action):
     last_layer = actor["params"]["Dense_1"]
     last_layer = {"kernel": jnp.zeros_like(last_layer["kernel"]), "bias": jnp.array([np.arctanh(action), -5.0], jnp.float32)}
     return {"params": {**actor["params"], "Dense_1": last_layer}}
+
+
+def columns(**given):
+    """A batch of B columns of zeros, but for what is given."""
+    zero, row = jnp.zeros(B), jnp.zeros((1, B))
+    zeros = dict(inputs=jnp.zeros((3, B)), next_inputs=jnp.zeros((3, B)), action=row, noise=row, next_noise=row, reward=zero, discount=zero)
+    return agents._Columns(**(zeros | dict(is_demonstration=jnp.zeros(B, bool), weight=None) | given))
 
 
 @pytest.mark.parametrize("base", BASES)
@@ -156,12 +164,36 @@ def test_the_filter_clones_only_what_is_better_than_the_policys_own_action():
         action=action, reward=1.0 - np.abs(action[:, 0]), discount=0.0, observation=(kind % 2)[:, None] * np.ones(2), is_demonstration=kind < 2
     )
     found = {}
-    for q_filter in (False, True):
+    for q_filter in ("off", "hard", "smooth"):
         states, metrics = train(4, batch, with_agent(bc_weight=100.0, q_filter=q_filter))
         found[q_filter] = mean_action(last(states), jnp.array([[0.0, 0.0], [1.0, 1.0]]))[:, 0]
         assert metrics["actor/bc_loss"].shape == (400,)
-    np.testing.assert_allclose(found[False], [0.9, 0.0], atol=0.15)
-    np.testing.assert_allclose(found[True], [0.0, 0.0], atol=0.3)
+    np.testing.assert_allclose(found["off"], [0.9, 0.0], atol=0.15)
+    np.testing.assert_allclose(found["hard"], [0.0, 0.0], atol=0.3)
+    np.testing.assert_allclose(found["smooth"], [0.0, 0.0], atol=0.3)
+
+
+@pytest.mark.parametrize(
+    ("base", "q_filter", "expected"),
+    # The first critic says the action, the second three times it. Demonstrated is 0.5, the policy's own is 0.2: means 1 and 0.4, variances 0.25 and
+    # 0.04 (one standard deviation is half of the difference): Phi(0.6 / sqrt(0.29) = 1.1142) = 0.8674. Rows of the replay are never cloned.
+    [("tqc", "off", 1.0), ("tqc", "hard", 1.0), ("tqc", "smooth", 0.8674), ("sac", "smooth", 0.8674)],
+)
+def test_how_much_is_cloned_by_hand(base, q_filter, expected, monkeypatch):
+    def quantiles(params, inputs, action, config):
+        return action * jnp.array([[1.0], [3.0]])
+
+    monkeypatch.setattr(agents, "mean_returns", quantiles)
+    monkeypatch.setattr(agents, "_value", lambda critics, inputs, action, config: jnp.mean(quantiles(critics, inputs, action, config), axis=0))
+    config, is_demonstration = with_agent(BASES[base], q_filter=q_filter), np.arange(B) % 2 == 0
+    block = columns(action=jnp.full((1, B), 0.5), is_demonstration=jnp.asarray(is_demonstration))
+    weight = agents._cloning_weight({}, block, jnp.full((1, B), 0.2), config)
+    np.testing.assert_allclose(weight, np.where(is_demonstration, expected, 0.0), atol=1e-4)
+
+
+def test_a_smooth_filter_needs_an_ensemble():
+    with pytest.raises(ValueError, match="num_critics = 1: raise it, or choose hard"):
+        AgentConfig(q_filter="smooth", num_critics=1)
 
 
 def test_weight_of_cloning_by_hand():

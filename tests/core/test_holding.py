@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from toy_env import Corridor, corridor_demonstrations
 
-from hindrl_jax.base.environments import RelabelsObservations, Restorable, can_step, compiler_options, state_dim
+from hindrl_jax.base.environments import RelabelsObservations, Restorable, action_to_env, can_step, compiler_options, state_dim
+from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Episodes
-from hindrl_jax.core.holding import hold, hold_demonstrations, longest_hold
+from hindrl_jax.config import TrainConfig
+from hindrl_jax.core.holding import hold, hold_demonstrations, longest_hold, with_action_hold
 
 FORWARD = jnp.array([1.0, 0.5])
 
@@ -135,6 +137,42 @@ def test_the_host_holds_actions_by_itself():
     assert not hasattr(held, "watched")  # it would show control steps
 
 
+def test_a_chunk_is_as_many_steps_with_an_action_each():
+    env = Corridor(horizon=20, width=10.0)
+    chunks, decision = hold(env, 3, chunks=True), jnp.array([1.0, 0.0, 2.0, 0.1, 0.5, 0.2])
+    assert (chunks.action_dim, hold(env, 3).action_dim, chunks.horizon) == (6, 2, 7)
+    (*_, (state, time_step)), (*_, (expected, last)) = follow(chunks, [decision, decision[::-1]])[1], follow(env, CHUNK + BACKWARDS)[1]
+    assert_equal_trees((state, time_step), (expected, last))
+
+
+CHUNK = [jnp.array(action) for action in ([1.0, 0.0], [2.0, 0.1], [0.5, 0.2])]
+BACKWARDS = [jnp.array(action) for action in ([0.2, 0.5], [0.1, 2.0], [0.0, 1.0])]
+
+
+def test_a_chunk_ends_where_the_task_is_solved():
+    env = Corridor(horizon=20, width=3.0)
+    state, time_step = follow(hold(env, 4, chunks=True), [jnp.array([2.0, 0.5, 1.5, 0.5, 2.0, 0.5, 2.0, 0.5])])[1][0]
+    assert (float(state.position), int(state.step)) == (3.5, 2)  # neither of the last two actions is taken
+    assert (float(time_step.reward), bool(time_step.terminated), bool(time_step.truncated)) == (1.0, True, False)
+
+
+def test_each_action_of_a_chunk_has_the_bounds_of_its_own_dimension():
+    bounded = hold(BoundedCorridor(), 3, chunks=True)
+    assert bounded.action_low.tolist() == [0.0, -1.0] * 3
+    assert bounded.action_high == 2.0
+    # [-1, 1] to [0, 2] and [-1, 2]
+    np.testing.assert_allclose(action_to_env(jnp.array([-1.0, -1.0, 0.0, 0.0, 1.0, 1.0]), bounded), [0.0, -1.0, 1.0, 0.5, 2.0, 2.0])
+
+
+@dataclass(frozen=True)
+class BoundedCorridor(Corridor):
+    """A corridor whose actions have bounds of their own."""
+
+    @property
+    def action_low(self):
+        return jnp.array([0.0, -1.0])
+
+
 def table(**changes):
     """One demonstration of 5 steps, in a table of 6: observations 0, 10, ..., actions 0.0, 0.1, ..., and padding that must not be read."""
     fields = dict(
@@ -160,6 +198,42 @@ def test_demonstrations_are_held_as_worked_by_hand():
     for leaf, before in zip(jax.tree.leaves(held), jax.tree.leaves(table()), strict=True):
         assert isinstance(leaf, np.ndarray)
         assert leaf.dtype == before.dtype
+
+
+def test_demonstrations_are_cut_into_chunks_as_worked_by_hand():
+    chunks, held = hold_demonstrations(table(), 2, chunks=True), hold_demonstrations(table(), 2)
+    # The third decision is a step alone, whose action 0.4 is repeated; nothing is blurred, and the padding is not read.
+    np.testing.assert_array_equal(chunks.actions[0], np.array([[0.0, 0.1], [0.2, 0.3], [0.4, 0.4]], np.float32))
+    jax.tree.map(np.testing.assert_array_equal, chunks.replace(actions=held.actions), held)  # all else is the same
+    # Of two dimensions the first action's come first; of a shorter demonstration its own last action is repeated.
+    actions = np.arange(24, dtype=np.float32).reshape(2, 6, 2)
+    both = jax.tree.map(lambda leaf: np.concatenate([leaf, leaf]), table()).replace(actions=actions, lengths=np.array([5, 4], np.int32))
+    found = hold_demonstrations(both, 3, chunks=True).actions
+    assert found.tolist() == [[[0, 1, 2, 3, 4, 5], [6, 7, 8, 9, 8, 9]], [[12, 13, 14, 15, 16, 17], [18, 19, 18, 19, 18, 19]]]
+    per_seed = jax.tree.map(lambda leaf: leaf[None], both)
+    assert hold_demonstrations(per_seed, 3, chunks=True).actions.tolist() == [found.tolist()]
+
+
+def test_a_demonstration_in_chunks_is_the_demonstration():
+    env = Corridor(horizon=7, width=3.0)
+    demonstrations = corridor_demonstrations((1.0, 0.5, 0.8), env=env)
+    chunks_env, chunks = hold(env, 2, chunks=True), hold_demonstrations(demonstrations, 2, chunks=True)
+    for index, length in enumerate(chunks.lengths):
+        state = env.vector_to_state(jax.random.key(0), chunks.states[index, 0])
+        for t in range(int(length)):
+            state, time_step = chunks_env.step(state, action_to_env(chunks.actions[index, t], chunks_env))
+            np.testing.assert_allclose(time_step.observation, chunks.observations[index, t + 1], atol=1e-5)
+        assert time_step.terminated
+
+
+def test_chunks_are_refused_where_there_would_be_none():
+    with pytest.raises(ValueError, match="action_hold = 1: raise that, too"):
+        TrainConfig(action_chunks=True, action_hold=1)
+    config = TrainConfig(action_chunks=True)
+    with pytest.raises(UserError, match="too short for chunks"):
+        with_action_hold(config, table())
+    long = with_action_hold(config, table(lengths=np.array([250], np.int32)))
+    assert (long.action_hold, long.action_chunks) == (4, True)
 
 
 def test_padding_of_held_demonstrations_is_finite():

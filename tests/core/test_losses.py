@@ -98,6 +98,24 @@ def test_behaviour_cloning_by_hand(form, expected):
 
 
 @pytest.mark.parametrize(
+    ("form", "expected"),
+    # Squared distances 25, 1 and 9 with weights 0.5, 1 and 0, divided by three rows; demonstrated lengths 4, 1 and 100: (0.5 * 4 + 1) / 1.5 = 2.
+    [("squared", 13.5 / 3), ("norm", (0.5 * 5.0 + 1.0) / 3), ("relative", 13.5 / 3 / 2.0)],
+)
+def test_weighted_behaviour_cloning_by_hand(form, expected):
+    demonstrated = jnp.array([[2.0, 1.0, 10.0]])
+    value = behaviour_cloning(demonstrated + jnp.array([[5.0, -1.0, 3.0]]), demonstrated, jnp.array([0.5, 1.0, 0.0]), form=form)
+    np.testing.assert_allclose(value, expected, rtol=1e-5)
+
+
+def test_small_weights_stay_small():
+    """Their sum is far below 1, and the mean length of what they weigh is still that of the actions: 0.001 * 1 / (2 rows * 4)."""
+    value = behaviour_cloning(jnp.array([[3.0, 3.0]]), jnp.array([[2.0, 9.0]]), jnp.array([1e-3, 0.0]), form="relative")
+    np.testing.assert_allclose(value, 1e-3 / 8, rtol=1e-5)
+    assert not behaviour_cloning(jnp.ones((1, 2)), jnp.zeros((1, 2)), jnp.zeros(2, bool), form="relative")
+
+
+@pytest.mark.parametrize(
     ("log_prob", "expected"),
     [
         # Target entropy -2. Entropies -mean(log_prob): -3 is below the target, so descent must raise log alpha; 0 is above it, so it must fall.

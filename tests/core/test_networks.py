@@ -1,5 +1,6 @@
 """Networks: shapes, the density of the squashed Gaussian, and an ensemble whose members differ."""
 
+import dataclasses
 import math
 
 import chex
@@ -10,7 +11,17 @@ import pytest
 from flax import linen as nn
 
 from hindrl_jax.config import AgentConfig
-from hindrl_jax.core.networks import LOG_STD_MAX, LOG_STD_MIN, ActionDistribution, apply_actor, apply_critics, init_actor, init_critics, mean_return
+from hindrl_jax.core.networks import (
+    LOG_STD_MAX,
+    LOG_STD_MIN,
+    ActionDistribution,
+    apply_actor,
+    apply_critics,
+    init_actor,
+    init_critics,
+    mean_return,
+    mean_returns,
+)
 
 CONFIG = AgentConfig(net_arch=(16, 12), num_critics=3, num_quantiles=5, layer_norm=True)
 B, INPUT_DIM, ACTION_DIM = 4, 3, 2
@@ -107,6 +118,60 @@ def test_mean_return_is_the_mean_of_the_quantiles(critics):
         for f in (lambda critics, action: mean_return(critics, INPUTS, action, CONFIG), by_definition)
     )
     chex.assert_trees_all_close(given, expected, atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def residual():
+    """The config of residual networks, and critics whose biases and normalisations are not what they begin with."""
+    config = dataclasses.replace(CONFIG, net_arch=(6, 6), residual=True)
+    critics = jax.jit(lambda key: init_critics(key, config, input_dim=INPUT_DIM, action_dim=ACTION_DIM))(jax.random.key(2))
+    leaves, tree = jax.tree.flatten(critics)
+    keys = jax.random.split(jax.random.key(3), len(leaves))
+    return config, jax.tree.unflatten(tree, [leaf + 0.3 * jax.random.normal(key, leaf.shape) for leaf, key in zip(leaves, keys, strict=True)])
+
+
+def normalised(rows, layer):
+    centred = rows - rows.mean(axis=0)
+    return centred / np.sqrt((centred**2).mean(axis=0) + 1e-6) * layer["scale"][:, None] + layer["bias"][:, None]
+
+
+def dense(rows, layer):
+    return layer["kernel"].T @ rows + layer["bias"][:, None]
+
+
+def test_residual_networks_are_the_blocks_of_simba(residual):
+    """Written down once more, layer by layer: embedding, two blocks x + W2 relu(W1 LN(x)), layer normalisation, output."""
+    config, critics = residual
+    action = np.tanh(INPUTS[:ACTION_DIM])
+    found = apply_critics(critics, INPUTS, action, config)
+    chex.assert_shape(found, (3, 5, B))
+    for n in range(3):
+        layers = jax.tree.map(lambda leaf, n=n: np.asarray(leaf[n], np.float64), critics)["params"]
+        x = dense(np.concatenate([INPUTS, action]), layers["Dense_0"])
+        for block, (first, second) in enumerate([("Dense_1", "Dense_2"), ("Dense_3", "Dense_4")]):
+            assert layers[first]["kernel"].shape == (6, 24)
+            x = x + dense(np.maximum(dense(normalised(x, layers[f"LayerNorm_{block}"]), layers[first]), 0.0), layers[second])
+        np.testing.assert_allclose(found[n], dense(normalised(x, layers["LayerNorm_2"]), layers["Dense_5"]), atol=1e-4)
+        assert len(layers) == 9
+
+
+def test_mean_return_of_residual_critics_is_the_mean_of_their_quantiles(residual):
+    config, critics = residual
+    action = jnp.tanh(INPUTS[:ACTION_DIM])
+    quantiles = apply_critics(critics, INPUTS, action, config)
+    np.testing.assert_allclose(mean_return(critics, INPUTS, action, config), jnp.mean(quantiles, axis=(0, 1)), atol=1e-5)
+    np.testing.assert_allclose(mean_returns(critics, INPUTS, action, config), jnp.mean(quantiles, axis=1), atol=1e-5)
+
+
+def test_the_residual_actor_has_blocks_too(residual):
+    config, _ = residual
+    actor = jax.eval_shape(lambda key: init_actor(key, config, input_dim=INPUT_DIM, action_dim=ACTION_DIM), jax.random.key(0))["params"]
+    assert [actor[f"Dense_{i}"]["kernel"].shape for i in range(6)] == [(3, 6), (6, 24), (24, 6), (6, 24), (24, 6), (6, 4)]
+
+
+def test_residual_blocks_have_one_width():
+    with pytest.raises(ValueError, match=r"net_arch = \(16, 12\): give equal ones"):
+        dataclasses.replace(CONFIG, residual=True)
 
 
 def numeric_log_density(action, mean, std):

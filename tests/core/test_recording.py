@@ -119,28 +119,35 @@ def test_training_episodes_may_begin_in_demonstrated_states_and_evaluations_neve
     assert evaluation.length.tolist() == [5] * 20  # from 0, velocity 1 passes 4 in the fifth step
 
 
-def test_a_reverse_curriculum_widens_from_the_end_of_the_demonstrations():
-    # Demonstrations of 5, 4 and 5 steps. The curriculum lasts for half of the 1,200 steps; each of the 3 environments takes 400 of them.
+def test_a_reverse_curriculum_moves_back_where_episodes_succeed():
+    """At velocity 1 every episode succeeds, from wherever it begins; at velocity 0 none does."""
     env = make_env()
-    config = make_config(demo_reset_ratio=1.0, demo_reset_curriculum=0.5, steps=1200, batch=BatchConfig(n_step=1))
+    config = make_config(demo_reset_ratio=0.75, demo_reset_curriculum=True, batch=BatchConfig(n_step=1))
     demonstrations, data = corridor_demonstrations(SPEEDS, env=env), make_data(config)
+    lengths = np.asarray(demonstrations.lengths)
 
     @jax.jit
-    def begin(key, progress):
-        return jax.vmap(lambda key: train._new_episodes(key, data, env, config, progress).observation)(jax.random.split(key, 300))
+    def run(key, bias):
+        state = with_output_bias(train.init(key, data, env, config), bias)
+        act = train.make_policy(agents.policy(state.agent, average=False).replace(noise=0.0), env, config)
 
-    for progress, share in ((0.0, 0.0), (0.25, 0.5), (0.5, 1.0), (1.0, 1.0)):
-        observations = np.asarray(begin(jax.random.key(1), progress)).reshape(-1, 3)
-        for demo, length in enumerate(demonstrations.lengths.tolist()):
-            eligible = min(max(int(np.ceil(share * length)), 1), length)
-            begun = observations[observations[:, 0] == 10 + demo, 1]
-            assert sorted(set(begun.tolist())) == list(range(length - eligible, length)), (progress, demo)
+        def step(state, key):
+            state = train._interact(key, state, data, env, config, act)
+            return state, state.curriculum
 
-    # It follows how far the run is: no episode of the first 30 steps of all begins before the last state but one.
-    state = jax.jit(lambda key: train.collect(train.init(key, data, env, config), data, env=env, config=config, num_iterations=10))(jax.random.key(0))
-    starts = [episode.observations[0] for _, _, episode in recorded_episodes(state.replay)]
-    assert len(starts) >= 3
-    assert all(start[1] >= demonstrations.lengths[int(start[0]) - 10] - 1 for start in starts)
+        return jax.lax.scan(step, state, jax.random.split(jax.random.fold_in(key, 7), 60))
+
+    state, curricula = run(jax.random.key(0), jnp.zeros(4))
+    first_steps = np.asarray(curricula.first_step)
+    assert (first_steps[0] == lengths - 1).all()
+    for demo, length in enumerate(lengths):  # 5, 4 and 5 steps: back by 4 from the last but one, or to the beginning
+        assert np.unique(first_steps[:, demo]).tolist() == [0, length - 1]
+    for _, _, episode in recorded_episodes(state.replay):
+        demo = int(episode.observations[0, 0]) - 10
+        if demo >= 0:  # it began in a demonstrated state, of which no other can be than the last but one until three have succeeded
+            np.testing.assert_array_equal(episode.observations[0], demonstrations.observations[demo, int(episode.observations[0, 1])])
+    _, curricula = run(jax.random.key(0), jnp.array([-9.0, 0.0, 0.0, 0.0]))
+    assert (np.asarray(curricula.first_step) == lengths - 1).all()
 
 
 def test_achieved_goals_are_given_to_new_episodes_and_judge_them():

@@ -72,23 +72,12 @@ def test_goal_is_kept_within_an_episode_and_drawn_anew_after_it(played):
     assert set(np.asarray(states.desired_goal)[over][:, 0].tolist()) == {7.0, 8.0, 9.0}
 
 
-@pytest.mark.parametrize(
-    ("share", "expected"),
-    # State (episode, t); the episodes have 2, 5 and 1 transitions, and their last states and what lies behind those are never drawn.
-    [
-        (1.0, [(0, 0), (0, 1), (1, 0), (1, 1), (1, 2), (1, 3), (1, 4), (2, 0)]),
-        (0.6, [(0, 0), (0, 1), (1, 2), (1, 3), (1, 4), (2, 0)]),  # 1.2, 3 and 0.6 states, rounded up
-        (0.2, [(0, 1), (1, 4), (2, 0)]),
-        (0.0, [(0, 1), (1, 4), (2, 0)]),  # at least one of each
-    ],
-)
-def test_starts_are_the_last_share_of_each_demonstration(share, expected):
-    states = np.full((3, 7, 2), np.nan, np.float32)
-    for episode, length in enumerate((2, 5, 1)):
-        states[episode, : length + 1] = [(episode, t) for t in range(length + 1)]
-    table = rollout.StartTable(states=jnp.asarray(states), lengths=jnp.array([2, 5, 1]))
-    drawn = jax.jit(rollout.sample_starts, static_argnums=2)(jax.random.key(0), table, 4000, share=share)
-    rows, counts = np.unique(np.asarray(drawn), axis=0, return_counts=True)
+def test_starts_are_all_states_of_demonstrations_but_the_last():
+    # (episode, t); the episodes have 2, 5 and 1 transitions, and their last states and what lies behind those are never drawn.
+    expected = [(0, 0), (0, 1), (1, 0), (1, 1), (1, 2), (1, 3), (1, 4), (2, 0)]
+    table = rollout.StartTable(states=jnp.zeros((3, 7, 2)), lengths=jnp.array([2, 5, 1]))
+    drawn = jax.jit(rollout.sample_starts, static_argnums=2)(jax.random.key(0), table, 4000)
+    rows, counts = np.unique(np.stack([drawn.demo, drawn.step], axis=1), axis=0, return_counts=True)
     assert rows.tolist() == [list(row) for row in expected]
     # Uniform over the states, not over the demonstrations; five deviations of a binomial.
     assert np.abs(counts - 4000 / len(expected)).max() < 5 * np.sqrt(4000 / len(expected))
@@ -100,7 +89,7 @@ DEMONSTRATIONS = corridor_demonstrations((1.0, 0.7), env=ENV)  # 4 and 5 steps, 
 @functools.partial(jax.jit, static_argnames="ratio")
 def starts(key, ratio):
     table = rollout.StartTable(states=DEMONSTRATIONS.states, lengths=DEMONSTRATIONS.lengths)
-    return rollout.reset(key, ENV, GOALS, 3000, rollout.DemoResets(starts=table, ratio=ratio, share=1.0))
+    return rollout.reset(key, ENV, GOALS, 3000, rollout.DemoResets(starts=table, ratio=ratio))
 
 
 @pytest.mark.parametrize("ratio", [0.0, 0.3, 1.0])
@@ -111,6 +100,8 @@ def test_the_given_share_of_episodes_begins_in_demonstrated_states(ratio):
     assert np.all(state.observation[~demonstrated][:, 1:] == 0.0)  # the environment's own start
     assert len(np.unique(state.observation[~demonstrated][:, 0])) >= (~demonstrated).sum() - 10  # of 2^23 possible ones
     assert set(state.desired_goal[:, 0].tolist()) == {7.0, 8.0, 9.0}  # goals are drawn as ever
+    np.testing.assert_array_equal(state.origin.demo, np.where(demonstrated, state.observation[:, 0] - 10, -1))
+    np.testing.assert_array_equal(state.origin.step[demonstrated], state.observation[demonstrated, 1])
     if ratio == 0.0:
         return
     # Each of the 4 + 5 states but the last ones, as often as any other.

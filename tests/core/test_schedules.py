@@ -14,9 +14,9 @@ def test_values_move_linearly_or_not_at_all(end, expected):
 
 @pytest.mark.parametrize(
     ("start", "end", "entropies"),  # at the beginning, after a quarter, and at the end
-    [(None, None, [-3.0, -3.0, -3.0]), (-1.0, None, [-1.0, -1.0, -1.0]), (None, 5.0, [-3.0, -1.0, 5.0]), (4.0, 0.0, [4.0, 3.0, 0.0])],
+    [(-1.0, None, [-3.0, -3.0, -3.0]), (-1.0, -2.0, [-3.0, -3.75, -6.0]), (2.0, 0.0, [6.0, 4.5, 0.0])],
 )
-def test_target_entropy_by_hand(start, end, entropies):
+def test_target_entropy_of_three_dimensions_by_hand(start, end, entropies):
     config = AgentConfig(target_entropy=start, final_target_entropy=end)
     assert [schedule(progress, 0, config, action_dim=3).target_entropy for progress in (0.0, 0.25, 1.0)] == entropies
 

@@ -41,9 +41,9 @@ def collected(seed, data):
     return collect(state, data, env=make_env(), config=make_config(), num_iterations=COLLECT_STEPS)
 
 
-def actor_of(state):
-    """The policy that explores."""
-    return agents.policy(state.agent, average=False)
+def actor_of(state, noise=0.0):
+    """The policy that explores, with its mean actions or, at noise 1, as it does."""
+    return agents.policy(state.agent, average=False).replace(noise=noise)
 
 
 @pytest.fixture(scope="module")
@@ -152,19 +152,19 @@ def test_clone_trains_the_actor_on_demonstrations_alone(data):
     chex.assert_trees_all_equal(state.replay, start.replay)
     chex.assert_trees_all_equal(state.agent.critics, start.agent.critics)
     # Demonstrated second actions are -0.5 throughout; the policy has left 0 for them.
-    act = train.make_policy(actor_of(state), make_env(), config, stochastic=False)
+    act = train.make_policy(actor_of(state), make_env(), config)
     action = act(jax.random.key(0), data.demonstrations.observations[:, 0], data.demonstrations.desired_goals)
     np.testing.assert_allclose(action[:, 1], -0.5, atol=0.3)
 
 
-def test_evaluation_plays_the_mean_action_where_the_policy_would_sample(data):
+def test_evaluation_plays_mean_actions_or_sampled_ones_as_the_policy_says(data):
     state = with_output_bias(init(jax.random.key(0), data, make_env(), make_config()), [0.0, 0.0, 0.0, 0.0])
     for seed in (1, 2):
         result = evaluate(jax.random.key(seed), actor_of(state), data, env=make_env(), config=make_config(), num_episodes=20)
         # Velocity 1 passes 4 in the fifth step.
         assert result.length.tolist() == [5] * 20
         assert result.success.tolist() == [True] * 20
-    act = train.make_policy(actor_of(state), make_env(), make_config(), stochastic=True)
+    act = train.make_policy(actor_of(state, noise=1.0), make_env(), make_config())
     result = jax.jit(lambda key: rollout.evaluate(key, make_env(), data.behavioural_goals, act, 20))(jax.random.key(3))
     assert len(set(result.length.tolist())) > 1
 
@@ -189,7 +189,7 @@ def test_warm_start_clones_the_actor_and_its_average_follows(data):
     assert (int(warm.updates), int(warm.env_steps)) == (300, 0)
     chex.assert_trees_all_equal(warm.agent.critics, start.agent.critics)
     chex.assert_trees_all_equal(warm.replay, start.replay)
-    act = train.make_policy(actor_of(warm), make_env(), config, stochastic=False)
+    act = train.make_policy(actor_of(warm), make_env(), config)
     action = act(jax.random.key(0), data.demonstrations.observations[:, 0], data.demonstrations.desired_goals)
     np.testing.assert_allclose(action[:, 1], -0.5, atol=0.2)
     chex.assert_trees_all_close(warm.agent.average_actor, warm.agent.actor, atol=0.1)  # it has followed

@@ -68,7 +68,7 @@ def test_the_summaries_speak_of_the_recipe_as_it_is():
     batch, agent = recipe.batch, recipe.agent
     assert (batch.n_step, batch.gamma, batch.max_demo_ratio, batch.relabelled_per_original, batch.batch_size) == (5, 0.98, 0.25, 0.25, 256)
     assert (agent.num_critics, agent.target_update_rate, agent.bc_weight, agent.initial_alpha) == (2, 0.02, 0.01, 0.002)
-    assert (agent.target_entropy, agent.final_target_entropy) == (-1.0, -10.0)
+    assert (agent.target_entropy, agent.final_target_entropy) == (-0.2, -2.0)
     assert (recipe.num_envs, recipe.updates_per_iteration) == (16, 2)
 
 

@@ -5,11 +5,13 @@ import json
 import shutil
 
 import chex
+import jax
 import numpy as np
 import pytest
 from tiny import CONFIG, ENV
 
 import hindrl_jax as hindrl
+from hindrl_jax.core.agent import policy
 from hindrl_jax.plotting import films
 
 
@@ -37,6 +39,26 @@ def test_a_saved_run_sees_its_inputs_as_it_did_in_training(saved, tmp_path):
     assert not scale.observation_centre.any()
     assert not scale.goal_centre.any()
     assert scale.goal_centre.shape == scale.goal.shape == (1, ENV.goal_dim)
+
+
+def test_a_saved_policy_chooses_between_its_actor_and_its_imitation_as_it_did_in_training(tmp_path):
+    """What is read back has both, and the critics that choose; played, it does what the policy in memory does."""
+    config = dataclasses.replace(CONFIG, imitation_proposal=2)
+    checkpoints = hindrl.Checkpoints(tmp_path / "checkpoint", seconds=0)
+    result = hindrl.fit(ENV, hindrl.record_demonstrations(ENV, 2), config, seeds=[0], report=checkpoints.save_when_due)
+    hindrl.save_run(tmp_path / "run", result)
+    run = hindrl.load_run(tmp_path / "run", last=True)
+    expected = policy(result.state.agent, average=True)
+    assert expected.actor.keys() == {"actor", "imitation", "critics"}
+    chex.assert_trees_all_equal(run.policies, jax.device_get(expected))
+    assert len(run.evaluate(episodes=3)) == 1
+    assert run.play(2, seed=0).lengths.shape == (2,)
+    imitation = jax.tree.leaves(expected.actor["imitation"])
+    assert any(np.abs(a - b).max() > 0 for a, b in zip(imitation, jax.tree.leaves(expected.actor["actor"]), strict=True))
+    # The same run, gone on with from its last checkpoint.
+    again = hindrl.fit(ENV, hindrl.record_demonstrations(ENV, 2), config, seeds=[0], restore=checkpoints.restore)
+    chex.assert_trees_all_equal(again.state.agent.imitation, result.state.agent.imitation)
+    chex.assert_trees_all_equal(again.returned.actor, result.returned.actor)
 
 
 def test_a_film_that_cannot_be_drawn_is_a_warning(saved, tmp_path, monkeypatch):

@@ -40,7 +40,7 @@ FRAMEWORK = {
     "gamma": 0.99,
     "target_update_rate": 0.005,
     "initial_alpha": 1.0,
-    "target_entropy": None,
+    "target_entropy": -1.0,
     "final_target_entropy": None,
     "num_critics": 2,
     "num_quantiles": 25,
@@ -100,6 +100,53 @@ def test_original_preset_differs_from_the_thesis_by_the_quirks_alone(env, more):
         "bc_loss": "norm",
         "bc_action": "sample",
     } | more
+
+
+# Ball et al. (2023): SAC with symmetric sampling, layer normalisation, large ensembles and 20 gradient steps for each environment step.
+RLPD = {
+    "base": "sac",
+    "num_critics": 10,
+    "num_target_critics": 2,
+    "layer_norm": True,
+    "net_arch": (256, 256),
+    "learning_rate": 3e-4,
+    "target_update_rate": 0.005,
+    "initial_alpha": 1.0,
+    "batch_size": 256,
+    "max_demo_ratio": 0.5,
+    "reach_zero": None,
+    "n_step": 1,
+    "gamma": 0.99,
+    "clip_targets": False,
+    "bc_weight": 0.0,
+    "bc_warm_start": 0,
+    "num_envs": 1,
+    "action_hold": 1,
+    "updates_per_iteration": 20,
+    "input_encoding": "raw",
+    "target_entropy": -0.5,
+    "final_target_entropy": None,
+}
+
+
+@pytest.mark.parametrize(
+    ("algo", "env", "relabelled"),
+    [
+        ("tqcfd", "FixedGridPickAndPlace", 0.0),
+        ("hindrl", "FixedGridPickAndPlace", 0.25),
+        ("hindrl", "ParameterizedReach", 1.0),
+        ("hindrl", "gymnasium:FetchReach-v4", 1.0),
+    ],
+)
+def test_rlpd_is_what_its_paper_says(algo, env, relabelled):
+    values = flat(preset(algo, "rlpd", env=env))
+    assert {name: values[name] for name in RLPD} == RLPD
+    assert (values["algo"], values["relabelled_per_original"]) == (algo, relabelled)
+
+
+def test_rlpd_is_no_behaviour_cloning():
+    with pytest.raises(UserError, match="rlpd is for reinforcement learning, which bc is not"):
+        preset("bc", "rlpd")
 
 
 TASKS = ["GridPickAndPlace", "FixedGridPickAndPlace", "FixedParameterizedReach", "ParameterizedReach", "gymnasium:FetchReach-v4"]

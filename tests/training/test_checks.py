@@ -9,7 +9,6 @@ from tiny import CONFIG, ENV
 from toy_env import Corridor
 
 import hindrl_jax as hindrl
-from hindrl_jax.config import with_values
 from hindrl_jax.training.checks import check_config, check_trainable
 
 
@@ -23,7 +22,10 @@ def demonstrations():
     [
         ([CONFIG], "1 configs for 2 seeds"),
         ([CONFIG, dataclasses.replace(CONFIG, num_envs=4)], "may differ only in union_sampling_ratio, gamma"),
-        ([CONFIG, with_values(CONFIG, {"final_target_entropy": -4.0})], "final_target_entropy is None in some"),
+        (
+            [CONFIG, dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, final_target_entropy=None))],
+            "final_target_entropy is None in some",
+        ),
     ],
 )
 def test_configs_that_need_programs_of_their_own_are_refused(configs, message, demonstrations):
@@ -94,6 +96,7 @@ def with_goals(behavioural_goals):
     [
         (Unrestorable(), dataclasses.replace(CONFIG, demo_reset_ratio=0.5), "it has no restorable states: set demo_reset_ratio to 0"),
         (HostCorridor(), dataclasses.replace(CONFIG, demo_reset_ratio=0.5), "it has no restorable states in JAX: set demo_reset_ratio to 0"),
+        (HostCorridor(), dataclasses.replace(CONFIG, action_chunks=True), "action_chunks = True needs a step in JAX, which HostCorridor"),
         (HostCorridor(), dataclasses.replace(CONFIG, agent_resets=(0.5,)), "needs a step in JAX, which HostCorridor does not have"),
         (HostCorridor(), with_goals("environment"), "HostCorridor, which gives its episodes no goals: choose another"),
         (ENV, with_goals("environment"), "FixedGridPickAndPlace, which gives its episodes no goals: choose another"),

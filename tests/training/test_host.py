@@ -143,7 +143,7 @@ def test_a_run_by_the_command_line_can_be_played_and_filmed(env, demonstrations,
     cli.main(["render", str(out), "--to", str(tmp_path / "film.gif")])
     with Image.open(tmp_path / "film.gif") as film:
         assert film.size == (20, 20)
-    cli.main(["eval", str(out), "--episodes", "3", "--stochastic"])
+    cli.main(["eval", str(out), "--episodes", "3", "--noise", "1"])
     assert POINT in capsys.readouterr().out
     for refused, message in [
         (["demos", "render", str(file)], "hold no states"),

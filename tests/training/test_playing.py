@@ -12,6 +12,7 @@ from toy_env import Corridor, corridor_demonstrations
 import hindrl_jax as hindrl
 from hindrl_jax.core import train
 from hindrl_jax.core.guidance import guidance
+from hindrl_jax.core.holding import hold, hold_demonstrations
 from hindrl_jax.tasks.registry import TASKS
 from hindrl_jax.training.playing import TrainedPolicies, player
 
@@ -20,11 +21,12 @@ def trained(env, demonstrations, **changes):
     """Two untrained policies, and what they aim at."""
     config = dataclasses.replace(CONFIG, algo="bc", **changes)
     table = demonstrations.replace(states=None)
+    decisions = hold(env, config.num_held, chunks=True) if config.action_chunks else env
 
     def begin(key):
-        data = guidance(table, env, config)
+        data = guidance(table, decisions, config)
         begun = train.RolloutState(env_state=(), observation=None, desired_goal=None, notes={})
-        return train.agents.policy(train.init(key, data, env, config, begun=begun).agent, average=True), data.behavioural_goals
+        return train.agents.policy(train.init(key, data, decisions, config, begun=begun).agent, average=True), data.behavioural_goals
 
     return TrainedPolicies(env, config, *jax.vmap(begin)(jax.random.split(jax.random.key(0), 2)))
 
@@ -42,6 +44,23 @@ def test_evaluations_are_alike_wherever_an_environment_is_stepped(num_held, leng
     again = trained(HostCorridor(), corridor_demonstrations(), action_hold=num_held).evaluate(keys, 5)
     np.testing.assert_array_equal(again.length, outcomes[1].length)
     assert all(stepper.closed for stepper in HostCorridor.made)
+
+
+def test_chunks_are_played_action_by_action():
+    """What is done in an episode is what the policy decided at every second step, in that order; evaluations play the same."""
+    env = Corridor()
+    policies = trained(env, hold_demonstrations(corridor_demonstrations(), 2, chunks=True), action_hold=2, action_chunks=True)
+    episodes = policies.play(jax.random.key(0), 1, 3)
+    choose = train.make_policy(jax.tree.map(lambda leaf: leaf[1], policies.policies), hold(env, 2, chunks=True), policies.config)
+    goal = policies.behavioural_goals.goals[1, :1]
+    for episode, length in enumerate(episodes.lengths):
+        for step in range(int(length)):
+            seen = episodes.observations[episode, step - step % 2]
+            chunk = np.asarray(choose(jax.random.key(0), seen[None], goal)[0]).reshape(2, 2)
+            np.testing.assert_allclose(episodes.actions[episode, step], chunk[step % 2], atol=1e-5)
+        assert np.abs(episodes.actions[episode, 0] - episodes.actions[episode, 1]).max() > 1e-3
+    outcome = policies.evaluate(jax.random.split(jax.random.key(1), 2), 5)
+    assert set(outcome.length.flat) <= {2, 4, 5}
 
 
 def test_what_steps_neither_in_jax_nor_many_at_once_is_played_by_the_tasks_own_player(monkeypatch):

@@ -1,0 +1,110 @@
+"""A cloned policy that proposes actions beside the actor: what is chosen, in episodes and in targets, and that it stays what it is."""
+
+import dataclasses
+import functools
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from corridor_training import make_config, make_data, make_env
+from probe import ACTIONS, CONFIG, B, fresh_agent, make_batch, one_update, with_agent, with_constant_critics
+
+from hindrl_jax.config import BatchConfig
+from hindrl_jax.core import agent as agents
+from hindrl_jax.core import train
+
+PROPOSING = dataclasses.replace(CONFIG, imitation_proposal=10)
+
+
+def playing(actor, action, *, log_std=-5.0):
+    """An actor whose mode is `action` everywhere."""
+    last_layer = actor["params"]["Dense_1"]
+    last_layer = {"kernel": jnp.zeros_like(last_layer["kernel"]), "bias": jnp.array([np.arctanh(action), log_std], jnp.float32)}
+    return {"params": {**actor["params"], "Dense_1": last_layer}}
+
+
+def preferring(critics, sign):
+    """Critics whose value rises with sign * action: the first hidden unit is relu(1 + sign * action / 2), and nothing else is read."""
+    first, last = critics["params"]["Dense_0"], critics["params"]["Dense_1"]
+    kernel = jnp.zeros_like(first["kernel"]).at[:, -1, 0].set(sign / 2.0)
+    bias = jnp.zeros_like(first["bias"]).at[:, 0].set(1.0)
+    output = {"kernel": jnp.zeros_like(last["kernel"]).at[:, 0].set(1.0), "bias": jnp.zeros_like(last["bias"])}
+    return {"params": {"Dense_0": {"kernel": kernel, "bias": bias}, "Dense_1": output}}
+
+
+def agent_of(config, *, sign):
+    """The actor plays 0.6, the imitation -0.4; the target critics say 1 + sign * action / 2: 1.3 and 0.8, or 0.7 and 1.2."""
+    start = fresh_agent(jax.random.key(0), config).replace(log_alpha=jnp.asarray(-30.0))
+    target_critics = preferring(start.target_critics, sign)
+    return start.replace(actor=playing(start.actor, 0.6), imitation=playing(start.imitation, -0.4), target_critics=target_critics)
+
+
+@pytest.mark.parametrize(("sign", "chosen"), [(1.0, 0.6), (-1.0, -0.4)])
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_what_is_done_is_what_the_target_critics_value_more(sign, chosen, noise):
+    state = agent_of(PROPOSING, sign=sign)
+    policy = agents.policy(state, average=False).replace(noise=noise)
+    action = agents.select_action(jax.random.key(1), policy, jnp.zeros((4, 3)), PROPOSING, action_dim=1)
+    np.testing.assert_allclose(action, chosen, atol=0.03 if noise else 1e-5)  # deviations of e^-5 = 0.007
+
+
+@pytest.mark.parametrize("base", ["tqc", "sac"])
+@pytest.mark.parametrize(("sign", "value"), [(1.0, 1.3), (-1.0, 1.2)])
+def test_targets_take_the_better_of_both_next_actions(base, sign, value):
+    config = with_agent(PROPOSING, base=base)
+    batch = make_batch(action=ACTIONS, reward=0.25, discount=0.5)
+    metrics = one_update(jax.random.key(0), agent_of(config, sign=sign), batch, config)[1]
+    np.testing.assert_allclose(metrics["critic/target"], 0.25 + 0.5 * value, atol=0.01)  # the actor's is sampled
+
+
+def test_the_bonus_for_entropy_is_only_the_actors():
+    # log alpha = 0, and the actor's log-probability at its mode, 0.6, is 5 - log(2 pi) / 2 - log(1 - 0.36) = 4.527: the bonus is -4.527.
+    for sign, expected in ((1.0, 1.3 - 4.527), (-1.0, 1.2)):
+        state = agent_of(PROPOSING, sign=sign).replace(log_alpha=jnp.asarray(0.0))
+        zero, row = jnp.zeros(B), jnp.zeros((1, B))
+        block = agents._Columns(
+            inputs=jnp.zeros((3, B)),
+            next_inputs=jnp.zeros((3, B)),
+            action=row,
+            noise=row,
+            next_noise=row,
+            reward=zero,
+            discount=zero + 1.0,
+            is_demonstration=zero > 0,
+            obtained_return=None,
+            weight=None,
+        )
+        np.testing.assert_allclose(agents._targets(state, state.target_critics, PROPOSING, block), expected, atol=1e-3)
+
+
+def test_the_imitation_is_frozen_and_the_rest_of_the_agent_learns():
+    start = agent_of(PROPOSING, sign=1.0)
+    after = one_update(jax.random.key(0), start, make_batch(action=ACTIONS, reward=ACTIONS[:, 0], discount=0.0), PROPOSING)[0]
+    chex.assert_trees_all_equal(after.imitation, start.imitation)
+    assert np.abs(after.actor["params"]["Dense_1"]["bias"] - start.actor["params"]["Dense_1"]["bias"]).max() > 0.0
+
+
+def test_no_imitation_is_kept_where_none_proposes():
+    state = with_constant_critics(fresh_agent(jax.random.key(0)), [0.0, 0.0])
+    assert state.imitation is None
+    assert agents.policy(state, average=False).actor is state.actor
+
+
+def test_the_imitation_is_cloned_and_all_else_stays_as_it_is():
+    agent = dataclasses.replace(make_config().agent, learning_rate=1e-2)
+    config = make_config(agent=agent, imitation_proposal=300, agent_resets=(0.01,), batch=BatchConfig(batch_size=32))
+    data, env = make_data(config), make_env()
+    start = train.init(jax.random.key(0), data, env, config)
+    state = jax.jit(functools.partial(train.imitate, env=env, config=config))(start, data)
+    chex.assert_trees_all_equal(state.agent.replace(imitation=None), start.agent.replace(imitation=None))
+    assert (int(state.updates), int(state.env_steps)) == (0, 0)
+    alone = dataclasses.replace(state.agent, actor=state.agent.imitation, imitation=None)
+    act = train.make_policy(agents.policy(alone, average=False).replace(noise=0.0), env, make_config(agent=agent))
+    action = act(jax.random.key(0), data.demonstrations.observations[:, 0], data.demonstrations.desired_goals)
+    np.testing.assert_allclose(action[:, 1], -0.5, atol=0.2)  # all demonstrated second actions
+    # An agent that begins anew keeps its imitation.
+    reset = jax.jit(functools.partial(train._reset_agent_if_due, env=env, config=config))(state.replace(env_steps=jnp.asarray(90)))
+    assert int(reset.resets) == 1
+    chex.assert_trees_all_equal(reset.agent.imitation, state.agent.imitation)
