@@ -25,7 +25,7 @@ import numpy as np
 from hindrl_jax.base.checks import check, check_types
 from hindrl_jax.base.types import Array, TimeStep
 from hindrl_jax.envs import panda, rotations
-from hindrl_jax.envs.cable import closed_form, geometry
+from hindrl_jax.envs.cable import chains, closed_form, geometry, mjx_dynamics, mujoco_dynamics
 from hindrl_jax.envs.cable.types import Backend, CableState, Scene
 
 _ACTION_BOUND = np.array(2 * (3 * [panda.MAX_TRANSLATION] + 3 * [panda.MAX_ROTATION] + [1.0]), np.float32)
@@ -61,9 +61,12 @@ class CableTask(abc.ABC):
     observation: Literal["full", "thesis"] = "full"
     """What is observed: all that the task depends on, or the original code's 31 numbers."""
     randomised: bool = False
-    """Whether the cables' weight, and how the socket takes the plug, are drawn anew for each episode, within 30%."""
+    """Whether the cables' weight, and how the socket takes the plug, are drawn anew for each episode, within 30%; only in closed form."""
+    num_links: int = 5
+    """Links of each cable in MuJoCo; the closed form's have none."""
     backend: Backend = "closed_form"
-    """Who simulates: closed_form (for bulk training)."""
+    """Who simulates: closed_form (for bulk training), mujoco (C MuJoCo, many episodes side by side, some fifty times slower), or mjx (the same
+    equations in JAX, for GPUs)."""
 
     def __post_init__(self):
         check_types(self)
@@ -71,7 +74,14 @@ class CableTask(abc.ABC):
             self,
             horizon=(self.horizon >= 1, "at least 1"),
             joint_noise=(self.joint_noise >= 0, "0 or more"),
+            randomised=(not self.randomised or self.backend == "closed_form", f"false with backend = {self.backend}"),
+            num_links=(2 <= self.num_links <= 20, "from 2 to 20"),
         )
+
+    @property
+    def compiler_options(self) -> dict[str, Any]:
+        """Options for XLA programs that step this environment."""
+        return mjx_dynamics.compiler_options() if self.backend == "mjx" else {}
 
     @property
     def action_dim(self) -> int:
@@ -150,7 +160,10 @@ class CableTask(abc.ABC):
         initial = jnp.broadcast_to(jnp.asarray(panda.INITIAL_JOINTS, jnp.float32), (2, panda.NUM_JOINTS))
         lower, upper = (jnp.broadcast_to(jnp.asarray(limit, jnp.float32), initial.shape) for limit in (panda.chain().lower, panda.chain().upper))
         joints = jnp.clip(initial + self.joint_noise * jax.random.normal(key_joints, initial.shape), lower, upper)
-        physics = closed_form.start(key_physics, joints, randomised=self.randomised)
+        if self.backend == "closed_form":
+            physics: Any = closed_form.start(key_physics, joints, randomised=self.randomised)
+        else:
+            physics = chains.start(joints, self.num_links)
         state = CableState(
             key=key_episode,
             rest=joints,
@@ -208,7 +221,7 @@ class CableTask(abc.ABC):
     @property
     def _dynamics(self) -> Any:
         """The module that simulates."""
-        return closed_form
+        return {"closed_form": closed_form, "mujoco": mujoco_dynamics, "mjx": mjx_dynamics}[self.backend]
 
     def _shapes(self) -> CableState:
         """The shapes of a state, with its physics in their compact form."""

@@ -8,7 +8,7 @@ from flax import struct
 
 from hindrl_jax.base.types import Array
 
-Backend = Literal["closed_form"]
+Backend = Literal["closed_form", "mujoco", "mjx"]
 """What simulates arms and cables."""
 
 
