@@ -32,8 +32,8 @@ _SOCKET = {  # measured in MuJoCo: what enters, and what jams
     "clearance": geometry.CLEARANCE,
     "capture_radius": 0.003,
     "capture_angle": np.radians(3.4),
-    "friction": 0.2,
-    "compliance": 0.1,
+    "friction": 0.3,
+    "compliance": 0.02,
 }
 _SPREAD = 0.3  # of the numbers above, and of the weights, where episodes are randomised
 _HELD_FINGER = geometry.FINGER_TOUCHING - 0.0002  # m, where the fingers come to rest on a grip

@@ -85,7 +85,8 @@ def plug_in_socket(before: tuple[Array, Array], after: tuple[Array, Array], sock
 
     was_inside = height_before < -_AT_MOUTH
     is_in = was_inside & (_length(aside_before) < geometry.CLEARANCE + geometry.CHAMFER)
-    at_bore = (height < 0.0) & (height > -geometry.TIPS[1])
+    mouth = jnp.where(off < socket.capture_radius, 0.0, geometry.CHAMFER)  # one that is too far aside rests on the chamfer's rim
+    at_bore = (height < mouth) & (height > -geometry.TIPS[1])
     entering = at_bore & ~was_inside & (off < socket.capture_radius) & (angle < socket.capture_angle)
     guided = at_bore & (is_in | entering)
 
@@ -103,7 +104,7 @@ def plug_in_socket(before: tuple[Array, Array], after: tuple[Array, Array], sock
 
     # Blocked by the mouth, or by the sleeve's outside.
     reach = geometry.SLEEVE_RADIUS + geometry.PIN_RADIUS - off
-    by_mouth = jnp.where(-height < reach, -height * axis, reach * outwards)
+    by_mouth = jnp.where(mouth - height < reach, (mouth - height) * axis, reach * outwards)
     blocked = at_bore & ~guided & (reach > 0.0)
     return jnp.where(guided, by_walls, jnp.where(blocked, by_mouth, 0.0)), jnp.where(guided, turning, 0.0)
 
