@@ -69,6 +69,14 @@ def scene(physics: Joints) -> Scene:
     )
 
 
+def cables(physics: Joints) -> Array:
+    """(2, L + 1, 3) m, the ends of the links of each cable, from the bar on."""
+    angles = physics.positions[2 * _PER_ARM :].reshape(2, -1)
+    anchors = jnp.asarray(geometry.ANCHORS)
+    ends = jax.vmap(lambda angles, anchor: _links(angles, anchor)[1])(angles, anchors)
+    return jnp.concatenate([anchors[:, None], ends], axis=1)
+
+
 def compact(physics: Joints) -> Joints:
     """All of it that the rest does not follow from: all of it."""
     return physics
@@ -79,18 +87,24 @@ def completed(physics: Joints) -> Joints:
     return physics
 
 
-def _head(angles: Array, anchor: Array) -> tuple[Array, Array]:
-    """The grip site (3,) in m and the orientation (3, 3) of the head of a cable at (2 L + 3,) rad."""
+def _links(angles: Array, anchor: Array) -> tuple[tuple[Array, Array], Array]:
+    """Where the last link of a cable at (2 L + 3,) rad ends, (3,) m and (3, 3), and where all of them do, (L, 3) m."""
     num_links = angles.shape[0] // 2 - 1
     length = geometry.CABLE_LENGTH / num_links
 
-    def link(carry: tuple[Array, Array], bend: Array) -> tuple[tuple[Array, Array], None]:
+    def link(carry: tuple[Array, Array], bend: Array) -> tuple[tuple[Array, Array], Array]:
         position, rotation = carry
         rotation = _bent(rotation, bend)
-        return (position + length * rotation[:, 2], rotation), None
+        position = position + length * rotation[:, 2]
+        return (position, rotation), position
 
     bends = angles[: 2 * num_links].reshape(num_links, 2)
-    (position, rotation), _ = jax.lax.scan(link, (anchor, jnp.asarray(geometry.HANGING)), bends)
+    return jax.lax.scan(link, (anchor, jnp.asarray(geometry.HANGING)), bends)
+
+
+def _head(angles: Array, anchor: Array) -> tuple[Array, Array]:
+    """The grip site (3,) in m and the orientation (3, 3) of the head of a cable at (2 L + 3,) rad."""
+    (position, rotation), _ = _links(angles, anchor)
     rotation = _bent(rotation, angles[-3:-1])
     x, y, z = rotation.T
     cos, sin = jnp.cos(angles[-1]), jnp.sin(angles[-1])

@@ -53,7 +53,7 @@ _OPTIONS = """
   <worldbody>
     <light pos="1.5 0 3" dir="-0.6 0 -0.8" directional="true" diffuse="0.25 0.25 0.25" specular="0 0 0" castshadow="false"/>
     <light pos="0.5 -1 3" dir="-0.3 0.4 -0.8" directional="true" diffuse="0.25 0.25 0.25" castshadow="false"/>
-    <geom name="floor" type="box" size="0.45 0.55 0.025" pos="-0.62 0 0.862" material="table"/>
+    <geom name="floor" type="plane" size="0.5 0.55 0.1" pos="-0.6 0 0.812" material="table"/>
   </worldbody>
   <contact/>
   <actuator/>
@@ -69,7 +69,10 @@ def model(num_links: int) -> Any:
 
 
 def xml(num_links: int) -> str:
-    """The model as text, with that many links in each cable."""
+    """The model as text, with that many links in each cable.
+
+    With none there are no cables, and the heads are free bodies: to draw, wherever they are.
+    """
     root = ET.fromstring(_OPTIONS)
     world, contact, actuator = (root.find(name) for name in ("worldbody", "contact", "actuator"))
     x, _, z = geometry.ANCHORS[0]
@@ -135,6 +138,11 @@ def _add_actuators(actuator: ET.Element, name: str) -> None:
 
 def _cable(name: str, index: int, num_links: int) -> ET.Element:
     """A chain of links, each on two hinges, and the head on three; the local z axis runs along it, from the bar down."""
+    if num_links == 0:
+        head = ET.Element("body", name=f"{name}_head")
+        _add(head, "freejoint")
+        _add_head(head, name, index)
+        return head
     length, mass = geometry.CABLE_LENGTH / num_links, geometry.CABLE_MASS / num_links
     root = ET.Element("body", name=f"{name}_stand", pos=_written(geometry.ANCHORS[index]), quat="0 1 0 0")
     parent = root
@@ -148,6 +156,11 @@ def _cable(name: str, index: int, num_links: int) -> ET.Element:
     head = _add(parent, "body", name=f"{name}_head", pos=(0, 0, length))
     _add_hinges(head, f"{name}_head", damping=0.0125)
     _add(head, "joint", name=f"{name}_head_z", type="hinge", axis="0 0 1", damping=0.002, armature=1e-5)
+    _add_head(head, name, index)
+    return root
+
+
+def _add_head(head: ET.Element, name: str, index: int) -> None:
     mass = geometry.HEAD_MASSES[index]
     slender = mass * 0.092**2 / 12
     _add(head, "inertial", pos=(0, 0, geometry.HEAD_CENTRES[index]), mass=mass, diaginertia=(slender, slender, _LEAST_INERTIA))
@@ -157,7 +170,6 @@ def _cable(name: str, index: int, num_links: int) -> ET.Element:
     _add(head, "site", name=f"{name}_grip", pos=(0, 0, geometry.GRIP))
     _add(head, "site", name=f"{name}_tip", pos=(0, 0, geometry.TIPS[index]))
     (_add_pin if index == 0 else _add_bore)(head)
-    return root
 
 
 def _add_hinges(body: ET.Element, name: str, *, damping: float) -> None:

@@ -19,6 +19,7 @@ ENVIRONMENTS = [
     ParameterizedReach(horizon=25, num_waypoints=3, orientation="axis_angle"),
     BringNear(horizon=25),
     CableInsertion(horizon=25, observation="thesis", randomised=True),
+    CableInsertion(horizon=25, backend="mujoco", num_links=3),
 ]
 every_environment = pytest.mark.parametrize("env", ENVIRONMENTS, ids=[f"{env.name}-{i}" for i, env in enumerate(ENVIRONMENTS)])
 
