@@ -26,6 +26,7 @@ class Joints(struct.PyTreeNode, kw_only=True):
 
     positions: Array  # (Q,) rad or m
     velocities: Array  # (Q,) rad/s or m/s
+    accelerations: Array  # (Q,) rad/s^2 or m/s^2, the last ones, from where the solver begins
 
 
 def start(joints: Array, num_links: int) -> Joints:
@@ -33,7 +34,8 @@ def start(joints: Array, num_links: int) -> Joints:
     fingers = jnp.broadcast_to(geometry.INITIAL_FINGER * jnp.array([1.0, -1.0]), (2, 2))
     arms = jnp.concatenate([joints, fingers], axis=1).reshape(-1)
     positions = jnp.concatenate([arms, jnp.zeros(2 * (2 * num_links + 3))])
-    return Joints(positions=positions, velocities=jnp.zeros_like(positions))
+    nothing = jnp.zeros_like(positions)
+    return Joints(positions=positions, velocities=nothing, accelerations=nothing)
 
 
 def arms(physics: Joints) -> tuple[Array, Array]:

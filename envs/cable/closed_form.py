@@ -88,7 +88,7 @@ def start(key: Array, joints: Array, *, randomised: bool) -> ClosedForm:
         joints=joints,
         velocities=jnp.zeros((2, 7)),
         postures=jax.vmap(panda.posture)(joints),
-        fingers=jnp.full(2, geometry.INITIAL_FINGER),
+        fingers=jnp.full(2, geometry.INITIAL_FINGER, jnp.float32),
         finger_speeds=jnp.zeros(2),
         held=jnp.zeros(2, bool),
         grasp_positions=jnp.zeros((2, 3)),

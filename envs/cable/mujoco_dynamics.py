@@ -3,8 +3,8 @@
 A control step is a pure function all the same: all that MuJoCo needs is in the state, and a callback from the compiled program hands it over. So
 training, evaluation and films work as with the other back ends, though not on a GPU's terms.
 
-MuJoCo's solver begins each control step anew, without the accelerations of the step before (`qacc_warmstart`), with which it would end elsewhere only
-by rounding.
+Its solver begins each control step with the accelerations with which the last one ended, taken from the velocities, since `rollout` does not say
+where the solver itself ended (`qacc_warmstart`).
 """
 
 from __future__ import annotations
@@ -36,24 +36,27 @@ def control_step(physics: Joints, rest: Array, finger_targets: Array, command: A
     What is not finite stays so, and MuJoCo never sees it.
     """
     controls = chains.controls(physics, rest, finger_targets, command)
-    shape = jax.ShapeDtypeStruct(physics.positions.shape, jnp.float32)
-    positions, velocities = jax.pure_callback(_roll, (shape, shape), physics.positions, physics.velocities, controls, vmap_method="broadcast_all")
-    return Joints(positions=positions, velocities=velocities)
+    shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.float32), physics)
+    return jax.pure_callback(_roll, shapes, physics, controls, vmap_method="broadcast_all")
 
 
-def _roll(positions: Any, velocities: Any, controls: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Joints and their velocities (..., Q) after a control step; controls (..., 18)."""
-    shape, size = positions.shape, positions.shape[-1]
-    positions, velocities, controls = (np.asarray(array, np.float64).reshape(-1, array.shape[-1]) for array in (positions, velocities, controls))
+def _roll(physics: Any, controls: Any) -> Any:
+    """Joints, leaves (..., Q), after a control step; controls (..., 18)."""
+    shape, size = physics.positions.shape, physics.positions.shape[-1]
+    given = (physics.positions, physics.velocities, physics.accelerations, controls)
+    positions, velocities, accelerations, controls = (np.asarray(array, np.float64).reshape(-1, array.shape[-1]) for array in given)
     batch = np.concatenate([np.zeros((len(positions), 1)), positions, velocities], axis=1)  # MuJoCo's full physics state begins with the time
-    usable = np.isfinite(batch).all(axis=1) & np.isfinite(controls).all(axis=1)
-    after = np.full((len(batch), 2 * size), np.nan, np.float32)
+    usable = np.isfinite(np.concatenate([batch, accelerations, controls], axis=1)).all(axis=1)
+    after = np.full((3, len(batch), size), np.nan, np.float32)
     if usable.any():
         with _LOCK:
             model, pool, data = _pool((size - 24) // 4)
-            states, _ = pool.rollout(model, data, batch[usable], controls[usable][:, None], nstep=position_actuators.SUBSTEPS, skip_checks=False)
-        after[usable] = states[:, -1, 1:]
-    return after[:, :size].reshape(shape), after[:, size:].reshape(shape)
+            options = {"nstep": position_actuators.SUBSTEPS, "initial_warmstart": accelerations[usable]}
+            states, _ = pool.rollout(model, data, batch[usable], controls[usable][:, None], **options)
+        speeds = states[:, -2:, 1 + size :]
+        after[:, usable] = states[:, -1, 1 : 1 + size], speeds[:, 1], (speeds[:, 1] - speeds[:, 0]) / position_actuators.SUBSTEP
+    positions, velocities, accelerations = after.reshape(3, *shape)
+    return Joints(positions=positions, velocities=velocities, accelerations=accelerations)
 
 
 @functools.cache

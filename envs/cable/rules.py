@@ -167,7 +167,7 @@ class CableTask(abc.ABC):
         state = CableState(
             key=key_episode,
             rest=joints,
-            finger_targets=jnp.full(2, geometry.MAX_FINGER / 2),
+            finger_targets=jnp.full(2, geometry.MAX_FINGER / 2, jnp.float32),
             physics=physics,
             scene=self._dynamics.scene(physics),
             step=jnp.zeros((), jnp.int32),

@@ -62,7 +62,7 @@ def test_where_everything_is_agrees_with_mujoco(num_links):
     m, data, rng = model.model(num_links), mujoco.MjData(model.model(num_links)), np.random.default_rng(0)
     for _ in range(5):
         positions = rng.uniform(-0.5, 0.5, m.nq).astype(np.float32)
-        scene = jax.jit(chains.scene)(chains.Joints(positions=jnp.asarray(positions), velocities=jnp.zeros(m.nv)))
+        scene = jax.jit(chains.scene)(chains.Joints(positions=jnp.asarray(positions), velocities=jnp.zeros(m.nv), accelerations=jnp.zeros(m.nv)))
         data.qpos[:] = positions
         mujoco.mj_kinematics(m, data)
         for index, name in enumerate(model.HEADS):
@@ -129,6 +129,7 @@ def test_a_step_is_ten_of_mujoco_s_own():
     state = jax.tree.map(lambda leaf: leaf[150], episode()).replace(key=jax.random.key(0))
     m, data = model.model(5), mujoco.MjData(model.model(5))
     data.qpos[:], data.qvel[:] = state.physics.positions, state.physics.velocities
+    data.qacc_warmstart[:] = state.physics.accelerations
     data.ctrl[:] = jax.jit(chains.controls)(state.physics, state.rest, state.finger_targets, jnp.zeros((2, 6)))
     mujoco.mj_step(m, data, 10)
     after = jax.jit(mujoco_dynamics.control_step)(state.physics, state.rest, state.finger_targets, jnp.zeros((2, 6)))

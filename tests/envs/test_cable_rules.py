@@ -12,7 +12,10 @@ from hindrl_jax.envs import panda
 from hindrl_jax.envs.cable import BringNear, CableInsertion, Scene, geometry
 from hindrl_jax.envs.cable.rules import MEETING, MEETING_HEADS, tip_error
 
-KEY = jax.random.key(0)
+
+def key():
+    """The same key, as often as it is wanted."""
+    return jax.random.key(0)
 
 
 def scene(gap, *, aside=0.0, tilt=0.0):
@@ -82,7 +85,7 @@ def test_one_arm_cannot_bring_the_tips_together():
 
 def test_an_observation_by_hand():
     env = CableInsertion()
-    state, _ = reset(env, KEY)
+    state, _ = reset(env, key())
     found = np.asarray(env.observe(state.replace(scene=scene(0.05))))
     np.testing.assert_allclose(found[:9], [0, 0, 0, 1, 0, 0, 0, 1, 0], atol=1e-6)  # position, and two columns of the rotation
     np.testing.assert_allclose(found[18:24], scene(0.05).head_positions.reshape(-1), atol=1e-6)  # from the hands, which are at 0
@@ -100,7 +103,7 @@ def test_an_observation_by_hand():
 def test_the_goal_says_what_solves_the_task(task):
     env = task()
     goal, tolerance = np.asarray(env.task_goal()), env.goal_tolerance
-    state, start = reset(env, KEY)
+    state, start = reset(env, key())
     assert goal[-1] == 1.0
     for gap in (-0.031, 0.0, 0.01, 0.019, 0.021, 0.1):
         found = np.asarray(env.observe(state.replace(scene=scene(gap))))
@@ -115,7 +118,7 @@ def test_the_goal_says_what_solves_the_task(task):
 
 
 def test_an_episode_starts_at_rest_at_the_initial_joints_with_noise():
-    states, observations = jax.jit(jax.vmap(BringNear().reset))(jax.random.split(KEY, 2000))
+    states, observations = jax.jit(jax.vmap(BringNear().reset))(jax.random.split(key(), 2000))
     deviations = np.asarray(states.physics.joints) - np.array(panda.INITIAL_JOINTS)
     np.testing.assert_allclose(deviations.std(axis=0), 0.02, rtol=0.12)
     assert np.abs(np.corrcoef(deviations.reshape(-1, 14).T) - np.eye(14)).max() < 0.15
@@ -128,14 +131,14 @@ def test_an_episode_starts_at_rest_at_the_initial_joints_with_noise():
 
 @BOTH_TASKS
 def test_both_back_ends_start_alike(task):
-    first, second = (reset(task(backend=backend), KEY)[0] for backend in ("closed_form", "mujoco"))
+    first, second = (reset(task(backend=backend), key())[0] for backend in ("closed_form", "mujoco"))
     chex.assert_trees_all_close(first.scene, second.scene, atol=1e-6)
     chex.assert_trees_all_equal(first.rest, second.rest)
 
 
 def test_randomised_episodes_differ_in_socket_and_weight_by_at_most_30_percent():
-    plain = reset(BringNear(), KEY)[0].physics
-    drawn = jax.jit(jax.vmap(BringNear(randomised=True).reset))(jax.random.split(KEY, 500))[0].physics
+    plain = reset(BringNear(), key())[0].physics
+    drawn = jax.jit(jax.vmap(BringNear(randomised=True).reset))(jax.random.split(key(), 500))[0].physics
     for name in ("clearance", "capture_radius", "capture_angle", "friction", "compliance"):
         ratio = np.asarray(getattr(drawn.socket, name)) / float(getattr(plain.socket, name))
         assert 0.7 <= ratio.min() < 0.72
@@ -150,7 +153,7 @@ def test_randomised_episodes_differ_in_socket_and_weight_by_at_most_30_percent()
 
 
 def test_a_gripper_s_command_moves_its_fingers_targets_by_its_sign_alone():
-    state, _ = reset(BringNear(), KEY)
+    state, _ = reset(BringNear(), key())
     np.testing.assert_allclose(state.finger_targets, 0.02)
     action = np.zeros(14, np.float32)
     action[[6, 13]] = 0.01, -1.0
@@ -165,7 +168,7 @@ def test_a_gripper_s_command_moves_its_fingers_targets_by_its_sign_alone():
 
 
 def test_each_arm_follows_its_own_command():
-    state, before = reset(BringNear(joint_noise=0.0), KEY)
+    state, before = reset(BringNear(joint_noise=0.0), key())
     action = np.zeros(14, np.float32)
     action[0], action[9] = 0.02, 0.02  # the plug's arm along x, the socket's along z
     for _ in range(5):
@@ -180,7 +183,7 @@ def test_each_arm_follows_its_own_command():
 def test_what_is_not_finite_stays_so_and_leaves_other_episodes_alone(backend, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # where MuJoCo would write its warnings
     env = BringNear(backend=backend)
-    states, _ = jax.vmap(env.reset)(jax.random.split(KEY, 3))
+    states, _ = jax.vmap(env.reset)(jax.random.split(key(), 3))
     actions = jnp.zeros((3, 14)).at[1, 2].set(jnp.nan)
     many = jax.jit(jax.vmap(env.step))
     for _ in range(2):
@@ -221,7 +224,7 @@ def test_an_angle_must_be_positive():
 def test_equal_environments_compile_once(backend):
     chex.clear_trace_counter()
     one_step = jax.jit(chex.assert_max_traces(lambda env, state, action: env.step(state, action), n=1), static_argnums=0)
-    state, _ = jax.eval_shape(BringNear(backend=backend).reset, KEY)
+    state, _ = jax.eval_shape(BringNear(backend=backend).reset, key())
     for _ in range(2):
         state, _ = one_step.trace(BringNear(backend=backend), state, jax.ShapeDtypeStruct((14,), jnp.float32)).out_info
 

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from hindrl_jax.envs.cable import closed_form, contact, geometry
 
 SOCKET = closed_form.start(jax.random.key(0), jnp.zeros((2, 7)), randomised=False).socket
-FREE = 1e9
 
 
 def heads(height, aside=0.0, tilt=0.0, turn=None):
@@ -59,7 +58,7 @@ def test_what_enters_and_what_is_blocked(aside, tilt, enters):
         assert abs(aside + found[1]) <= geometry.CLEARANCE + 1e-6  # the chamfer has brought it in line
     else:
         assert height == pytest.approx(geometry.CHAMFER if aside > 0.003 else 0.0, abs=1e-6)  # not a bit of it is in
-        np.testing.assert_allclose(found[[0, 1, 3, 4, 5]], 0.0, atol=1e-6)  # and nothing brings it in line
+        np.testing.assert_allclose(found[np.array([0, 1, 3, 4, 5])], 0.0, atol=1e-6)  # and nothing brings it in line
 
 
 def test_one_that_is_blocked_stays_out_however_long_it_is_pressed():
@@ -83,12 +82,13 @@ def test_walls_hold_the_plug_sideways_and_friction_holds_it_back():
 
 def test_a_turning_hand_jams_the_plug_most_near_the_mouth():
     def advance(depth):
-        return float(0.004 - correction(heads(-depth), heads(-depth - 0.004, tilt=0.055))[2])
+        """Of 4 mm, turned by 5 mrad more than the clearance leaves at the depth."""
+        return float(0.004 - correction(heads(-depth + 0.004), heads(-depth, tilt=0.0006 / depth + 0.005))[2])
 
-    assert advance(0.0015) > 0.003  # hardly entered, it may still be that oblique
-    assert 0.0 <= advance(0.012) < advance(0.025) < 0.004
-    found = correction(heads(-0.021), heads(-0.025, tilt=0.05))
-    turned = 0.05 - 0.0006 / 0.025  # beyond what the clearance leaves at this depth
+    assert advance(0.012) == pytest.approx(0.004 - 0.3 * 0.02 * 0.005 / 0.012, abs=1e-5)
+    assert advance(0.030) == pytest.approx(0.004 - 0.3 * 0.02 * 0.005 / 0.030, abs=1e-5)
+    found = correction(heads(-0.021), heads(-0.025, tilt=0.03))
+    turned = 0.03 - 0.0006 / 0.025  # beyond what the clearance leaves at this depth
     assert np.linalg.norm(found[3:]) == pytest.approx(turned, rel=1e-3)
     assert found[2] == pytest.approx(0.3 * 0.02 * turned / 0.025, rel=1e-2)
 
