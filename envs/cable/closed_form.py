@@ -1,7 +1,7 @@
 """Arms and cables in closed form, for training in bulk: one control step of 50 ms of the MuJoCo model in `model`. Pure and unbatched.
 
-  * The arms follow their position actuators (`panda.position_actuators`). A held head with half of its cable hangs on the hand as a weight: without
-    it no arm sinks, and what is precise here is not in MuJoCo.
+  * The arms follow their position actuators (`panda.position_actuators`). A held head with a share of its cable hangs on the hand as a weight:
+    without it no arm sinks, and what is precise here is not in MuJoCo.
   * A free head swings on its cable as a pendulum does; a held one is rigid with the hand. Fingers take a head when they close round its grip.
   * A taut cable holds the hand back like a leash. It tears the head out of the fingers only if the arm is far beyond.
   * Hands do not pass through each other, nor the plug through the socket (`contact`).
@@ -27,7 +27,8 @@ from hindrl_jax.envs.panda import position_actuators
 from hindrl_jax.envs.panda.linear_algebra import inverse, product, times
 
 _GRAVITY = 9.81  # m/s^2
-_WEIGHTS = _GRAVITY * (geometry.HEAD_MASSES + geometry.CABLE_MASS / 2)  # (2,) N, of a head and half of its cable
+_CARRIED = 0.2  # share of a cable that the hand carries where heads meet: idle arms then sink as in MuJoCo
+_WEIGHTS = _GRAVITY * (geometry.HEAD_MASSES + _CARRIED * geometry.CABLE_MASS)  # (2,) N
 _SOCKET = {  # measured in MuJoCo: what enters, and what jams
     "clearance": geometry.CLEARANCE,
     "capture_radius": 0.003,

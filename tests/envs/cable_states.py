@@ -23,7 +23,8 @@ def on_the_way():
 
 
 def state_in_c(situation, index=0):
-    return jax.tree.map(lambda leaf: leaf[index], on_the_way()[0][situation])
+    states = on_the_way()[0][situation].replace(key=None)
+    return jax.tree.map(lambda leaf: leaf[index], states).replace(key=jax.random.key(index))
 
 
 def in_closed_form(state):

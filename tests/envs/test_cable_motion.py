@@ -80,13 +80,14 @@ def sinking(state, env, steps=100):
     return np.asarray(state.scene.hand_positions[:, 2] - scenes.hand_positions[-1, :, 2])
 
 
-def test_idle_arms_sink_under_the_weight_of_their_cables_as_in_mujoco():
+@pytest.mark.parametrize("situation", ["lifted", "inserting"])
+def test_idle_arms_sink_under_the_weight_of_their_cables_as_in_mujoco(situation):
     """Each control step aims at where the joints are now, so nothing brings an arm back: some 10 mm in 5 s."""
-    state = state_in_c("lifted")
+    state = state_in_c(situation)
     in_c, in_closed = sinking(state, IN_C), sinking(in_closed_form(state), IN_CLOSED_FORM)
     assert (in_c > 0.004).all()
     np.testing.assert_allclose(in_closed, in_c, atol=0.003)
-    light = lifted()
+    light = in_closed_form(state)
     light = light.replace(physics=light.physics.replace(weights=jnp.zeros(2)))
     assert np.abs(sinking(light, IN_CLOSED_FORM)).max() < 0.003
 

@@ -146,7 +146,7 @@ def test_randomised_episodes_differ_in_socket_and_weight_by_at_most_30_percent()
     ratio = np.asarray(drawn.weights) / np.asarray(plain.weights)
     assert 0.7 <= ratio.min() < 0.72
     np.testing.assert_allclose(ratio[:, 0], ratio[:, 1], rtol=1e-5)
-    np.testing.assert_allclose(plain.weights, 9.81 * (np.array([0.01187, 0.01689]) + 0.0196), rtol=1e-5)
+    np.testing.assert_allclose(plain.weights, 9.81 * (np.array([0.01187, 0.01689]) + 0.2 * 0.0392), rtol=1e-5)
 
 
 # --- steps
