@@ -24,6 +24,7 @@ SITUATIONS = {
     "grasped": "both heads have just been taken",
     "lifted": "both heads are carried to each other",
     "inserting": "the plug is before the socket or in it",
+    "inserting_steadily": "the same, by an expert whose hand is steady there",
 }
 STEPS = (1, 20)
 NAMES = {"closed_form": "closed form", "mjx": "MJX", "mujoco": "C MuJoCo"}
@@ -38,6 +39,8 @@ def run(options: Options) -> list[Row]:
     num_starts, num_episodes = (1, QUICK_EPISODES) if options.quick else (NUM_STARTS, NUM_EPISODES)
     print(f"{TITLE}: mean / largest distance from C MuJoCo", flush=True)
     starts, commands = situations(jax.random.key(0), num_starts)
+    steady = situations(jax.random.key(0), num_starts, CableExpert(insertion_noise=0.0))
+    starts["inserting_steadily"], commands["inserting_steadily"] = (found["inserting"] for found in steady)
     rows: list[Row] = []
     for backend in ("closed_form",) if options.quick else ("closed_form", "mjx"):  # MJX takes minutes to compile
         env = CableInsertion(backend=backend)
@@ -61,15 +64,16 @@ def run(options: Options) -> list[Row]:
 IN_C = CableInsertion(backend="mujoco")
 
 
-def situations(key: Array, num_starts: int) -> tuple[dict[str, CableState], dict[str, Array]]:
+def situations(key: Array, num_starts: int, expert: CableExpert | None = None) -> tuple[dict[str, CableState], dict[str, Array]]:
     """States of C MuJoCo, leaves (N, ...), and the expert's commands (N, T, 14) from there on, for each situation."""
+    expert = expert or CableExpert()
     key_reset, key_act = jax.random.split(key)
 
     def episode(key_reset: Array, key_act: Array) -> tuple[CableState, Array]:
         def step(carry: tuple[CableState, Array], _: None) -> tuple[tuple[CableState, Array], tuple[Any, Array]]:
             state, key = carry
             key, key_step = jax.random.split(key)
-            action = CableExpert().act(key_step, IN_C, state)
+            action = expert.act(key_step, IN_C, state)
             return (IN_C.step(state, action)[0], key), (state.replace(key=None), action)
 
         return jax.lax.scan(step, (IN_C.reset(key_reset)[0], key_act), length=500)[1]
