@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import hindrl_jax
 from benchmarks import report, timing
 from benchmarks.timing import Contestant, Options, Row
-from hindrl_jax.base.environments import Steppable, action_to_env
+from hindrl_jax.base.environments import Steppable, action_to_env, compiler_options
 from hindrl_jax.base.types import Array
 from hindrl_jax.core import rollout
 from hindrl_jax.core.goals import constant_goal
@@ -67,7 +67,10 @@ def stepper(env: Steppable, num_envs: int, *, resets: bool, num_actions: int = N
 
         return jax.lax.scan(all_actions, carry, length=repeats)[0]
 
-    return timing.calls(timing.advancing(jax.jit(steps, donate_argnums=0), start, keys, actions), units=num_envs * num_actions * repeats)
+    return timing.calls(
+        timing.advancing(jax.jit(steps, donate_argnums=0, compiler_options=compiler_options(env)), start, keys, actions),
+        units=num_envs * num_actions * repeats,
+    )
 
 
 def tables(rows: list[Row]) -> str:

@@ -46,7 +46,21 @@ def main() -> None:
 
     import jax
 
-    from benchmarks import environments, gradient_step, host_loop, reach_parity, reach_speed, relabelling, replay_size, report, seeds, startup, timing
+    from benchmarks import (
+        cable_parity,
+        cable_speed,
+        environments,
+        gradient_step,
+        host_loop,
+        reach_parity,
+        reach_speed,
+        relabelling,
+        replay_size,
+        report,
+        seeds,
+        startup,
+        timing,
+    )
     from benchmarks.timing import Effort, Options
 
     parts = {
@@ -54,6 +68,8 @@ def main() -> None:
         "environments": environments,
         "reach_speed": reach_speed,
         "reach_parity": reach_parity,
+        "cable_speed": cable_speed,
+        "cable_parity": cable_parity,
         "host_loop": host_loop,
         "relabelling": relabelling,
         "replay_size": replay_size,

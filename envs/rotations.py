@@ -52,3 +52,15 @@ def from_six_d(columns: Array) -> Array:
 def between(source: Array, target: Array) -> Array:
     """The rotation vector (3,) that turns matrix `source` into `target`, in the axes that both are given in."""
     return to_rotation_vector(jnp.sum(target[:, None, :] * source[None, :, :], axis=2))
+
+
+def turning(source: Array, target: Array) -> Array:
+    """The shortest rotation vector (3,) that turns the direction `source` into `target`, both unit vectors (3,); 0 where they are opposite."""
+    normal = jnp.cross(source, target)
+    sine = jnp.sqrt(jnp.sum(jnp.square(normal)) + 1e-20)
+    return normal / sine * jnp.arctan2(sine, jnp.sum(source * target))
+
+
+def angle(first: Array, second: Array) -> Array:
+    """() rad between two unit vectors (3,)."""
+    return jnp.arctan2(jnp.sqrt(jnp.sum(jnp.square(jnp.cross(first, second)))), jnp.sum(first * second))

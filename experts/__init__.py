@@ -4,8 +4,9 @@ Public are the experts below, `experts.robosuite_arm`, and `experts.by_hand.reco
 method act(key, env, state) -> action, or act(observation, rng) for environments of Gymnasium.
 """
 
+from hindrl_jax.experts.cable import CableExpert
 from hindrl_jax.experts.fetch import FetchPickAndPlaceExpert, FetchReachExpert
 from hindrl_jax.experts.grid import GridExpert
 from hindrl_jax.experts.reach import ReachExpert
 
-__all__ = ["FetchPickAndPlaceExpert", "FetchReachExpert", "GridExpert", "ReachExpert"]
+__all__ = ["CableExpert", "FetchPickAndPlaceExpert", "FetchReachExpert", "GridExpert", "ReachExpert"]

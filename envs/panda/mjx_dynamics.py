@@ -19,8 +19,18 @@ from hindrl_jax.envs.panda import controller, robot
 from hindrl_jax.envs.panda.kinematics import posture
 
 
+def compiler_options() -> dict[str, Any]:
+    """Options for XLA programs with MJX in them. On CPUs, XLA's concurrent scheduler can leave large batches of MJX waiting for ever, and its newer
+    fusion code made MJX several hundred times slower (both seen with jaxlib 0.10.2); from 0.11.1 on, MJX is fast with that code, and XLA no longer
+    knows the option that turns it off."""
+    if jax.default_backend() != "cpu":
+        return {}
+    fusion = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11, 1) else {}
+    return {"xla_cpu_enable_concurrency_optimized_scheduler": False} | fusion
+
+
 @functools.cache
-def _mjx() -> Any:
+def import_mjx() -> Any:
     """The module, without the lines that it prints about an absent optional package."""
     robot.import_mujoco()
     with contextlib.redirect_stdout(io.StringIO()):
@@ -31,12 +41,12 @@ def _mjx() -> Any:
 @functools.cache
 def _model() -> Any:
     with jax.ensure_compile_time_eval():
-        return _mjx().put_model(robot.model())
+        return import_mjx().put_model(robot.model())
 
 
 def control_step(joints: Array, velocities: Array, rest: Array, command: Array) -> tuple[Array, Array]:
     """One control step: `controller.joint_targets`, then 25 substeps of MJX. Arguments and result are those of `closed_form.control_step`."""
-    mjx, model = _mjx(), _model()
+    mjx, model = import_mjx(), _model()
     goal = controller.joint_targets(joints, rest, command, posture(joints))
     limits = model.actuator_ctrlrange
 

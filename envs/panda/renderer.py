@@ -36,7 +36,7 @@ class Renderer:
         """Opens the context.
 
         Args:
-          model: MuJoCo model of the arm, with the names of panda.xml.
+          model: MuJoCo model with the names of panda.xml, or with these after a prefix for each of several arms.
           view: the camera.
 
         Raises:
@@ -63,13 +63,13 @@ class Renderer:
         self._gl = None  # deleted at exit, OSMesa's would complain
 
     def hand_position(self, joints: Any) -> np.ndarray:
-        """(3,) m, of the grip site at joints (7,), in rad."""
+        """(3,) m, of the one arm's grip site at joints (7,), in rad."""
         self._data.qpos[:] = np.asarray(joints)
         mujoco.mj_kinematics(self._model, self._data)
         return self._data.site("grip_site").xpos.copy()
 
     def pose(self, joints: Any) -> None:
-        """Starts a picture, of the arm at these joints (7,), in rad."""
+        """Starts a picture, of the arm at these joints (7,), in rad, or of all that moves in another model."""
         self._data.qpos[:] = np.asarray(joints)
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
@@ -99,12 +99,12 @@ class Renderer:
         for point in (start, end):
             self._add(mujoco.mjtGeom.mjGEOM_CYLINDER, (radius, 1e-4, 0.0), (*point[:2], floor), axes, (*colour, 1.0))
 
-    def shade_arm(self) -> None:
-        """Lays the arm's shadow on the floor."""
-        bodies = [self._data.body(f"link{i}").xpos for i in range(8)] + [self._data.body("hand").xpos]
+    def shade_arm(self, prefix: str = "") -> None:
+        """Lays the shadow of an arm, whose bodies' names begin with `prefix`, on the floor."""
+        bodies = [self._data.body(f"{prefix}link{i}").xpos for i in range(8)] + [self._data.body(f"{prefix}hand").xpos]
         for start, end in itertools.pairwise(bodies):
             self.shade(start, end, 0.05, _SHADOW, 0.001)
-        hand, y = bodies[-1], self._data.body("hand").xmat.reshape(3, 3)[:, 1]
+        hand, y = bodies[-1], self._data.body(f"{prefix}hand").xmat.reshape(3, 3)[:, 1]
         self.shade(hand - 0.08 * y, hand + 0.08 * y, 0.03, _SHADOW, 0.001)
 
     def render(self) -> np.ndarray:

@@ -98,13 +98,8 @@ class ReachTask(abc.ABC):
 
     @property
     def compiler_options(self) -> dict[str, Any]:
-        """Options for XLA programs that step this environment. On CPUs, XLA's concurrent scheduler can leave large batches of MJX waiting for ever,
-        and its newer fusion code made MJX several hundred times slower (both seen with jaxlib 0.10.2); from 0.11.1 on, MJX is fast with that code,
-        and XLA no longer knows the option that turns it off."""
-        if self.backend != "mjx" or jax.default_backend() != "cpu":
-            return {}
-        fusion = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11, 1) else {}
-        return {"xla_cpu_enable_concurrency_optimized_scheduler": False} | fusion
+        """Options for XLA programs that step this environment."""
+        return mjx_dynamics.compiler_options() if self.backend == "mjx" else {}
 
     @property
     def observation_low(self) -> np.ndarray:

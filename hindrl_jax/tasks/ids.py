@@ -23,6 +23,8 @@ MAX_EPISODE_STEPS = {
     "FixedGridPickAndPlace": 100,
     "ParameterizedReach": 300,
     "FixedParameterizedReach": 300,
+    "BringNear": 450,
+    "CableInsertion": 750,
 }
 """The names of `hindrl_jax.tasks.registry.TASKS` and their horizons, written out, since reading them there would import JAX."""
 

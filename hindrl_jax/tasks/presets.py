@@ -19,7 +19,7 @@ The default is `TrainConfig()`, whatever the task is called. What differs betwee
     target entropy         counts per action dimension
     random steps           one horizon in each environment
 
-The thesis has settings for the grid worlds and others for the reach tasks.
+The thesis has settings for the grid worlds and others for the reach tasks, which here are those of the cable tasks, too, on which it trained nothing.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from hindrl_jax.base.environments import Environment, RelabelsObservations
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.steppers import can_step_on_host
 from hindrl_jax.config import AgentConfig, Algorithm, BatchConfig, GoalConfig, QuirksConfig, TrainConfig
+from hindrl_jax.envs.cable import CableTask
 from hindrl_jax.envs.reach import ReachTask
 from hindrl_jax.tasks.from_gymnasium import GymnasiumEnv
 from hindrl_jax.tasks.registry import did_you_mean, make
@@ -59,7 +60,7 @@ def preset(algo: Algorithm = "hindrl", name: Preset = "default", *, env: str | E
         return _as_algorithm(_rlpd(algo, env), algo)
     if isinstance(env, GymnasiumEnv):
         raise UserError(f"the preset {name} is for the thesis's tasks: choose default for environments of Gymnasium")
-    return _as_algorithm({"thesis": _thesis, "original": _original}[name](algo, reach=isinstance(env, ReachTask)), algo)
+    return _as_algorithm({"thesis": _thesis, "original": _original}[name](algo, reach=isinstance(env, ReachTask | CableTask)), algo)
 
 
 def original_rules(env: type[Any]) -> dict[str, Any]:

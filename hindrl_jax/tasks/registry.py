@@ -17,9 +17,11 @@ from typing import Any
 from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Array, Episodes
+from hindrl_jax.envs.cable import BringNear, CableInsertion
 from hindrl_jax.envs.grid import FixedGridPickAndPlace, GridPickAndPlace
 from hindrl_jax.envs.reach import FixedParameterizedReach, ParameterizedReach
 from hindrl_jax.experts import fetch
+from hindrl_jax.experts.cable import CableExpert
 from hindrl_jax.experts.grid import GridExpert
 from hindrl_jax.experts.reach import ReachExpert
 from hindrl_jax.experts.robosuite_arm import play_in_robosuite
@@ -49,6 +51,7 @@ class Task:
 
 
 _GRID_VIEWER, _REACH_VIEWER = "hindrl_jax.envs.grid.viewer", "hindrl_jax.envs.reach.viewer"
+_CABLE_VIEWER = "hindrl_jax.envs.cable.viewer"
 
 TASKS: dict[str, Task] = {
     task.environment.name: task
@@ -57,6 +60,8 @@ TASKS: dict[str, Task] = {
         Task(FixedGridPickAndPlace, GridExpert, _GRID_VIEWER, "each of them within a small box of its own (thesis 3.1.2)"),
         Task(ParameterizedReach, ReachExpert, _REACH_VIEWER, "a Panda arm reaches random poses in order (thesis 3.2.1)", play_in_robosuite),
         Task(FixedParameterizedReach, ReachExpert, _REACH_VIEWER, "the same, with poses that never change (thesis 3.2.2)", play_in_robosuite),
+        Task(BringNear, CableExpert, _CABLE_VIEWER, "two Panda arms bring the ends of two cables together (thesis 3.2.3)"),
+        Task(CableInsertion, CableExpert, _CABLE_VIEWER, "the same arms put one cable's plug into the other's socket (thesis 3.2.4)"),
     )
 }
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hindrl_jax.base.environments import RestorableEnvironment
-from hindrl_jax.envs import FixedGridPickAndPlace, FixedParameterizedReach, GridPickAndPlace, ParameterizedReach
+from hindrl_jax.envs import BringNear, CableInsertion, FixedGridPickAndPlace, FixedParameterizedReach, GridPickAndPlace, ParameterizedReach
 
 ENVIRONMENTS = [
     GridPickAndPlace(),
@@ -17,6 +17,9 @@ ENVIRONMENTS = [
     FixedGridPickAndPlace(num_objects=3),
     FixedParameterizedReach(horizon=25),
     ParameterizedReach(horizon=25, num_waypoints=3, orientation="axis_angle"),
+    BringNear(horizon=25),
+    CableInsertion(horizon=25, observation="thesis", randomised=True),
+    CableInsertion(horizon=25, backend="mujoco", num_links=3),
 ]
 every_environment = pytest.mark.parametrize("env", ENVIRONMENTS, ids=[f"{env.name}-{i}" for i, env in enumerate(ENVIRONMENTS)])
 

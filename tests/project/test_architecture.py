@@ -32,6 +32,8 @@ SCREEN = {"PIL", "os"}  # what all of them may import
 BEYOND = {
     "robot": {"mujoco", "pathlib"},  # to read the model's file
     "mjx_dynamics": {"mujoco", "contextlib", "io"},
+    "mujoco_dynamics": {"mujoco", "os", "threading"},
+    "model": {"xml"},
     "renderer": {"atexit"},
     "meshes": {"importlib", "pathlib"},
     "opengl": {"ctypes", "importlib", "sys"},

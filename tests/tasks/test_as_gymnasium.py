@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode
 import hindrl_jax as hindrl
 from hindrl_jax.base.environments import action_from_env
 from hindrl_jax.base.errors import UserError
+from hindrl_jax.experts.cable import CableExpert
 from hindrl_jax.experts.grid import GridExpert
 from hindrl_jax.experts.reach import ReachExpert
 from hindrl_jax.tasks.as_gymnasium import GoalVectorEnv
@@ -20,8 +21,12 @@ from hindrl_jax.tasks.ids import MAX_EPISODE_STEPS, gymnasium_id
 from hindrl_jax.tasks.registry import TASKS
 
 GRID = "hindrl/FixedGridPickAndPlace-v0"
-REACH = ("ParameterizedReach", "FixedParameterizedReach")
-EXPERTS = {False: GridExpert(random_action_probability=0.0), True: ReachExpert(randomness_scale=0.0)}
+ARMS = ("ParameterizedReach", "FixedParameterizedReach", "BringNear", "CableInsertion")
+EXPERTS = {
+    GridExpert: GridExpert(random_action_probability=0.0),
+    ReachExpert: ReachExpert(randomness_scale=0.0),
+    CableExpert: CableExpert(translation_noise=0.0, rotation_noise=0.0, insertion_noise=0.0),
+}
 
 
 def test_every_environment_is_registered_with_its_horizon():
@@ -38,14 +43,14 @@ def test_importing_the_package_registers_and_loads_neither_jax_nor_anything_of_o
 @pytest.mark.parametrize("name", TASKS)
 def test_gymnasium_finds_no_fault(name):
     env = gymnasium.make(gymnasium_id(name)).unwrapped
-    check_env(env, skip_render_check=name in REACH)  # the arm's pictures need OpenGL
-    assert env.metadata["render_fps"] == (20 if name in REACH else 7)
+    check_env(env, skip_render_check=name in ARMS)  # the arms' pictures need OpenGL
+    assert env.metadata["render_fps"] == (20 if name in ARMS else 7)
 
 
 @pytest.mark.parametrize("name", TASKS)
 def test_the_expert_is_rewarded_where_and_only_where_compute_reward_says_so(name):
     env = gymnasium.make(gymnasium_id(name), max_episode_steps=1000)
-    task, expert = env.unwrapped._task.env, EXPERTS[name in REACH]
+    task, expert = env.unwrapped._task.env, EXPERTS[TASKS[name].expert]
     act = jax.jit(lambda seed, state: action_from_env(expert.act(jax.random.key(seed), task, state), task))
     env.reset(seed=3)
     steps, terminated = 0, False
@@ -64,7 +69,7 @@ def test_the_expert_is_rewarded_where_and_only_where_compute_reward_says_so(name
 @pytest.mark.parametrize("name", TASKS)
 def test_a_continuing_task_rewards_each_step_at_the_goal(name):
     env = gymnasium.make(gymnasium_id(name), max_episode_steps=400, continuing_task=True)
-    task, expert = env.unwrapped._task.env, EXPERTS[name in REACH]
+    task, expert = env.unwrapped._task.env, EXPERTS[TASKS[name].expert]
     act = jax.jit(lambda seed, state: action_from_env(expert.act(jax.random.key(seed), task, state), task))
     env.reset(seed=3)
     rewards, truncated = [], False
@@ -214,6 +219,7 @@ def test_pictures_show_the_present_state():
         ("FixedGridPickAndPlace", {"num_objectss": 3}, "did you mean 'num_objects'"),
         ("FixedParameterizedReach", {"backend": "robosuite"}, "closed_form"),
         ("FixedParameterizedReach", {"orientation": "axis_angle"}, "compute_reward cannot be had"),
+        ("BringNear", {"observation": "thesis"}, "compute_reward cannot be had"),
         ("FixedGridPickAndPlace", {"continuing_task": "false"}, "continuing_task = 'false' is not usable"),
     ],
 )

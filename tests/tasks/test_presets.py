@@ -73,6 +73,7 @@ def flat(config: TrainConfig) -> dict:
         ("FixedGridPickAndPlace", APPENDIX),
         ("ParameterizedReach", APPENDIX_REACH),
         ("FixedParameterizedReach", APPENDIX_REACH),
+        ("CableInsertion", APPENDIX_REACH),
     ],
 )
 @pytest.mark.parametrize(("algo", "relabelled", "filtered"), [("tqcfd", 0, False), ("hindrl", 4, False), ("smooth-hindrl", 4, True)])
@@ -149,7 +150,15 @@ def test_rlpd_is_no_behaviour_cloning():
         preset("bc", "rlpd")
 
 
-TASKS = ["GridPickAndPlace", "FixedGridPickAndPlace", "FixedParameterizedReach", "ParameterizedReach", "gymnasium:FetchReach-v4"]
+TASKS = [
+    "GridPickAndPlace",
+    "FixedGridPickAndPlace",
+    "FixedParameterizedReach",
+    "ParameterizedReach",
+    "BringNear",
+    "CableInsertion",
+    "gymnasium:FetchReach-v4",
+]
 
 
 def test_there_is_one_recipe_and_what_differs_follows_from_what_an_environment_does():
@@ -162,6 +171,8 @@ def test_there_is_one_recipe_and_what_differs_follows_from_what_an_environment_d
         "GridPickAndPlace": {},
         "FixedGridPickAndPlace": {},
         "FixedParameterizedReach": {},
+        "BringNear": {},
+        "CableInsertion": {},
         "ParameterizedReach": many_tasks | {"behavioural_goals": "task"},
         "gymnasium:FetchReach-v4": many_tasks | {"behavioural_goals": "environment", "epsilon": 0.0289},  # 0.05 over the root of 3
     }
