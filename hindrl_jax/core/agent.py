@@ -27,7 +27,7 @@ from hindrl_jax.core.schedules import Schedule
 
 Metrics = dict[str, Array]
 
-_ADAM = optax.scale_by_adam()  # the step size is applied apart, since it may change along a run
+_ADAM = optax.scale_by_adam()  # the step size is applied apart, since it may be an array, in sweeps
 
 
 class AgentState(struct.PyTreeNode, kw_only=True):

@@ -37,7 +37,7 @@ NEARBY_GOAL = "nearby_goal"
 
 
 def goal_source(table: GoalTable, config: BatchConfig) -> GoalSource:
-    """The source that a config asks for: one, or a mixture.
+    """The source that a config asks for: one, or several, each for its share of the rows.
 
     Args:
       table: the demonstrations' goals, with their observations.

@@ -1,4 +1,4 @@
-"""Losses of TQC (Kuznetsov et al., 2020), of SAC, TD3 and DDPG, and of learning from demonstrations, as functions of arrays.
+"""Losses of TQC (Kuznetsov et al., 2020), of SAC, and of learning from demonstrations, as functions of arrays.
 
 Atoms (quantiles) lie on the leading axes and the batch on the last. How truncation and the quantile loss are computed fast is in `kernels`.
 """
@@ -56,7 +56,7 @@ def target_atoms(next_atoms: Array, *, reward: Array, discount: Array, entropy_b
 def target_value(next_values: Array, *, reward: Array, discount: Array, entropy_bonus: Array | float) -> Array:
     """The target of algorithms without quantiles: r + discount * (min over critics of the next value + bonus).
 
-    Clipped double Q-learning (Fujimoto et al., TD3, 2018, eq. 10), with the bonus of SAC; with one critic the target of DDPG.
+    Clipped double Q-learning (Fujimoto et al., TD3, 2018, eq. 10), with the bonus of SAC.
 
     Args:
       next_values: (C, B) values of the target critics at the next state and action.
