@@ -88,8 +88,6 @@ def test_hands_do_not_pass_through_each_other(backend):
     scene = played(backend, "into each other", "lifted").scene
     depth = jax.jit(jax.vmap(jax.vmap(lambda positions, rotations: jnp.linalg.norm(contact.hands_apart(positions, rotations)))))
     assert depth(scene.hand_positions, scene.hand_rotations).max() < 0.03  # of 60 mm; the closed form's hands have other capsules
-    sideways = np.asarray(scene.hand_positions[:, :, 0, 1] - scene.hand_positions[:, :, 1, 1])
-    assert sideways.min() > -0.02
 
 
 @BACKENDS
