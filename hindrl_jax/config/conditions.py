@@ -34,7 +34,7 @@ CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
         "n_step gamma bootstrap_past_relabelled_goals timeouts_are_terminal importance_exponent demo_priority_bonus "
         "achieved_goal_ratio clip_targets num_critics num_target_critics num_quantiles top_quantiles_to_drop_per_net "
         "layer_norm target_update_rate initial_alpha target_entropy final_target_entropy bc_weight agent_resets num_envs "
-        "updates_per_iteration learning_starts buffer_size random_actions demo_reset_ratio demo_reset_curriculum",
+        "updates_per_iteration learning_starts buffer_size demo_reset_ratio demo_reset_curriculum",
         lambda c: c.learns_from_rollouts,
         "behaviour cloning does not use it: choose another algo",
     ),

@@ -40,8 +40,6 @@ class TrainConfig:
     """Gradient steps after each decision of all environments; None takes one for every 4 control steps."""
     learning_starts: int = 0
     """Environment steps with uniformly random actions before the first gradient step; at least one horizon in each environment is taken."""
-    random_actions: float = 0.0
-    """Share of the training decisions that are uniformly random, as in HER (Andrychowicz et al., 2017): for what the policy would never try."""
     demo_reset_ratio: float = 0.0
     """Share of training episodes that begin in a demonstrated state, drawn uniformly, with the steps that it had left (Nair et al., overcoming
     exploration in reinforcement learning with demonstrations, 2018). Evaluations never do."""
@@ -82,7 +80,6 @@ class TrainConfig:
             action_hold=(self.action_hold is None or self.action_hold >= 1, "at least 1, or None"),
             stop_at=(self.stop_at is None or 0.0 < self.stop_at <= 1.0, "greater than 0 and at most 1, or None"),
             learning_starts=(self.learning_starts >= 0, "0 or more"),
-            random_actions=(0.0 <= self.random_actions <= 1.0, "between 0 and 1"),
             demo_reset_ratio=(0.0 <= self.demo_reset_ratio <= 1.0, "between 0 and 1"),
             bc_warm_start=(self.bc_warm_start >= 0, "0 or more"),
             imitation_proposal=(self.imitation_proposal >= 0, "0 or more"),

@@ -172,20 +172,6 @@ def make_policy(policy: Policy, env: Environment, config: TrainConfig) -> Act:
     return act
 
 
-def make_explorer(policy: Policy, env: Environment, config: TrainConfig) -> Act:
-    """How training acts: by the policy, but for a share of random actions."""
-    by_policy, at_random = make_policy(policy, env, config), act_at_random(env)
-
-    def act(key: Array, observation: Array, desired_goal: Array) -> Array:
-        if config.random_actions == 0.0:
-            return by_policy(key, observation, desired_goal)
-        key, key_choice, key_random = jax.random.split(key, 3)
-        is_random = jax.random.bernoulli(key_choice, config.random_actions, (observation.shape[0], 1))
-        return jnp.where(is_random, at_random(key_random, observation, desired_goal), by_policy(key, observation, desired_goal))
-
-    return act
-
-
 def act_at_random(env: Environment) -> Act:
     """Uniformly random actions."""
 
@@ -272,7 +258,7 @@ def learn(
 
     def iteration(state: TrainState, _: None) -> tuple[TrainState, Metrics]:
         key, key_interact, key_batch, key_updates = jax.random.split(state.key, 4)
-        act = make_explorer(agents.policy(state.agent, average=False), env, config)
+        act = make_policy(agents.policy(state.agent, average=False), env, config)
         after = _interact(key_interact, state.replace(key=key), guidance, env, config, act)
         state = after.replace(sampler=sampler.record(state.sampler, state.replay, after.replay))
         batches, drawn = sampler.draw(key_batch, state, guidance)

@@ -207,7 +207,7 @@ def with_goals(key: Array, episodes: RolloutState, guidance: Guidance) -> Rollou
 def decide(key: Array, explorer: Policy, episodes: RolloutState, *, env: Environment, config: TrainConfig, at_random: bool) -> tuple[Array, Plan]:
     """What the environments are to do, and the key of the next iteration."""
     key, key_act, key_goals, key_nearby, key_batch, key_updates = jax.random.split(key, 6)
-    act = training.act_at_random(env) if at_random else training.make_explorer(explorer, env, config)
+    act = training.act_at_random(env) if at_random else training.make_policy(explorer, env, config)
     action = act(key_act, episodes.observation, episodes.desired_goal)
     keys = dict(key_goals=key_goals, key_nearby=key_nearby, key_batch=key_batch, key_updates=key_updates)
     return key, Plan(action=action, env_action=action_to_env(action, env), **keys)

@@ -56,7 +56,6 @@ VALUES = {
     "num_envs": (3, 2),
     "updates_per_iteration": (2, 1),
     "learning_starts": (30, 20),
-    "random_actions": (0.5, 0.25),
     "demo_reset_ratio": (0.5, 0.25),
     "demo_reset_curriculum": (True, False),
     "bc_warm_start": (2, 3),

@@ -123,7 +123,6 @@ BAD = [
     (TrainConfig, "num_envs", [0]),
     (TrainConfig, "updates_per_iteration", [0]),
     (TrainConfig, "learning_starts", [-1]),
-    (TrainConfig, "random_actions", [-0.1, 1.1, None]),
     (TrainConfig, "demo_reset_ratio", [-0.1, 1.1, None]),
     (TrainConfig, "action_hold", [0, -1, 2.5]),
     (TrainConfig, "stop_at", [0.0, -0.1, 1.01]),

@@ -169,20 +169,6 @@ def test_evaluation_plays_mean_actions_or_sampled_ones_as_the_policy_says(data):
     assert len(set(result.length.tolist())) > 1
 
 
-@pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
-def test_a_share_of_training_actions_is_random(data, share):
-    """The policy always plays (0, 0), and random actions are uniform in [-1, 1]: half of them lie above 0, and half of those above 0.5."""
-    state = with_output_bias(init(jax.random.key(0), data, make_env(), make_config()), [0.0, 0.0, 0.0, 0.0])
-    act = train.make_explorer(actor_of(state), make_env(), make_config(random_actions=share))
-    actions = np.asarray(jax.jit(act)(jax.random.key(1), jnp.zeros((8000, 3)), jnp.zeros((8000, 1))))
-    is_random = (actions != 0.0).all(axis=1)
-    assert ((actions == 0.0).all(axis=1) == ~is_random).all()
-    assert is_random.mean() == pytest.approx(share, abs=0.02)
-    if share:
-        assert (actions[is_random] > 0.5).mean() == pytest.approx(0.25, abs=0.02)
-        assert np.abs(actions).max() <= 1.0
-
-
 def test_reset_and_step_are_traced_once(data):
     reset = jax.jit(chex.assert_max_traces(rollout.reset, n=1), static_argnums=(1, 3))
     step = jax.jit(chex.assert_max_traces(rollout.step, n=1), static_argnums=3)
