@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
@@ -18,9 +17,7 @@ from hindrl_jax.core import train as training
 from hindrl_jax.core.batch import sample_batch
 from hindrl_jax.core.guidance import Guidance, guidance
 from hindrl_jax.core.train import TrainState
-from hindrl_jax.training import prioritised
 from hindrl_jax.training.devices import over_seeds, spread
-from hindrl_jax.training.prioritised import Priorities, sampler_for
 
 _RUN_ONCE = {"xla_backend_optimization_level": 0}  # for a program whose compilation takes longer than its one run
 
@@ -45,11 +42,10 @@ class Loop:
         demonstrations = jax.tree.map(lambda leaf: np.stack([leaf] * num_seeds), jax.device_get(demonstrations))
         demonstrations, seeds = spread((demonstrations, np.arange(num_seeds, dtype=np.uint32)), self._mesh)
         key = jax.jit(over_seeds(jax.random.key, self._mesh))(seeds)
-        self._with_sampler = functools.partial(self._program, sampler=sampler_for(self.env, config))
         self.data: Guidance = jax.jit(self._program(guidance))(demonstrations)
-        self.state: TrainState = jax.jit(self._with_sampler(training.init)).lower(key, self.data).compile(_RUN_ONCE)(key, self.data)
+        self.state: TrainState = jax.jit(self._program(training.init)).lower(key, self.data).compile(_RUN_ONCE)(key, self.data)
         num_iterations = self.capacity // config.num_envs if full else training.warm_up_iterations(self.env, config)
-        collect = jax.jit(self._with_sampler(training.collect, num_iterations=num_iterations), donate_argnums=0)
+        collect = jax.jit(self._program(training.collect, num_iterations=num_iterations), donate_argnums=0)
         self.state = jax.block_until_ready(collect(self.state, self.data))
 
     @property
@@ -62,7 +58,7 @@ class Loop:
         num_iterations, rest = divmod(num_updates, self.config.num_updates)
         if rest:
             raise ValueError(f"{num_updates} gradient steps are no multiple of the {self.config.num_updates} of an iteration")
-        learn = jax.jit(self._with_sampler(training.learn, num_iterations=num_iterations), donate_argnums=0).lower(self.state, self.data).compile()
+        learn = jax.jit(self._program(training.learn, num_iterations=num_iterations), donate_argnums=0).lower(self.state, self.data).compile()
 
         def call() -> None:
             self.state, metrics = learn(self.state, self.data)
@@ -86,7 +82,7 @@ def first_seed(tree: Any) -> Any:
 
 
 def sampler(loop: Loop, config: TrainConfig, num_batches: int) -> Callable[[], Transition]:
-    """Compiles the uniform drawing of `num_batches` batches, one after the other, from the replay that the loop (of one seed) has at each call."""
+    """Compiles the drawing of `num_batches` batches, one after the other, from the replay that the loop (of one seed) has at each call."""
 
     @jax.jit
     def draw(key: Array, state: TrainState, data: Guidance) -> Transition:
@@ -96,34 +92,3 @@ def sampler(loop: Loop, config: TrainConfig, num_batches: int) -> Callable[[], T
 
     key = jax.random.key(0)
     return lambda: jax.block_until_ready(draw(key, loop.state, loop.data))
-
-
-def prioritised_sampler(loop: Loop, num_batches: int) -> Callable[[], None]:
-    """As `sampler`, by the priorities of a loop that has them: as many batches at a time as in its iterations, then new priorities for their rows.
-
-    Each call goes on from the priorities that the last one left. Errors are made up; what it takes to compute them is not in here.
-    """
-    config, together = loop.config, loop.config.num_updates
-
-    @functools.partial(jax.jit, donate_argnums=0)
-    def draw(first: Priorities, key: Array, state: TrainState, data: Guidance) -> tuple[Priorities, Transition]:
-        state, data = first_seed((state, data))
-
-        def iteration(before: Priorities, key: Array) -> tuple[Priorities, Transition]:
-            def sample(key: Array) -> tuple[Transition, prioritised.Drawn]:
-                return prioritised.sample_batch(key, state.replace(sampler=before), data, loop.env, config)
-
-            batches, drawn = jax.vmap(sample)(jax.random.split(key, together))
-            return prioritised.assign(before, drawn, batches.weight, config.priority), batches
-
-        return jax.lax.scan(iteration, first, jax.random.split(key, num_batches // together))
-
-    key = jax.random.key(0)
-    latest = jax.tree.map(jnp.copy, first_seed(loop.state.sampler))
-
-    def call() -> None:
-        nonlocal latest
-        latest, batches = draw(latest, key, loop.state, loop.data)
-        jax.block_until_ready((latest, batches))
-
-    return call

@@ -1,4 +1,4 @@
-"""Whether a large replay slows learning down, what priorities cost there, and how much memory a stored transition takes."""
+"""Whether a large replay slows learning down, and how much memory a stored transition takes."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ import numpy as np
 
 import hindrl_jax
 from benchmarks import report, timing
-from benchmarks.loop import Loop, prioritised_sampler, sampler, whole_episodes
+from benchmarks.loop import Loop, sampler, whole_episodes
 from benchmarks.timing import Options, Row
 from hindrl_jax.base.environments import Environment
-from hindrl_jax.config import PriorityConfig
 
 TITLE = "Replay size"
 SIZES = (10_000, 1_000_000)
@@ -24,8 +23,7 @@ ROUNDS = 3  # times those of the other parts, since the difference sought is sma
 
 
 def run(options: Options) -> list[Row]:
-    """For the whole loop (milliseconds per gradient step) and for the drawing of a batch alone, a row per size and one for the largest with
-    priorities; one row for the memory."""
+    """For the whole loop (milliseconds per gradient step) and for the drawing of a batch alone, a row per size; one row for the memory."""
     print(f"{TITLE}: the default recipe with a full replay", flush=True)
     config = hindrl_jax.preset("hindrl")
     loops = {}
@@ -33,21 +31,16 @@ def run(options: Options) -> list[Row]:
         loop = Loop(dataclasses.replace(config, buffer_size=whole_episodes(size, config.num_envs)), full=True)
         loops[loop.capacity] = loop
     largest = loops[max(loops)]
-    priority = PriorityConfig(priority_exponent=0.6, demo_priority_bonus=1.0)
-    prioritised = Loop(dataclasses.replace(largest.config, priority=priority), full=True)
     effort = dataclasses.replace(options.effort, rounds=ROUNDS * options.effort.rounds)
     sampling = {capacity: timing.calls(sampler(loop, config, BATCHES_PER_CALL), units=BATCHES_PER_CALL) for capacity, loop in loops.items()}
     learning = {capacity: timing.calls(loop.learner(UPDATES_PER_CALL), units=UPDATES_PER_CALL) for capacity, loop in loops.items()}
-    learning["prioritised"] = timing.calls(prioritised.learner(UPDATES_PER_CALL), units=UPDATES_PER_CALL)
-    sampling["prioritised"] = timing.calls(prioritised_sampler(prioritised, BATCHES_PER_CALL), units=BATCHES_PER_CALL)
     rows = []
-    for part, contestants in (("learn", learning), ("sample_batch", sampling)):
-        for name, result in timing.take_turns(contestants, effort).items():
-            what, loop = (f"{part}_prioritised", prioritised) if name == "prioritised" else (part, loops[name])
-            rows.append({"what": what, "capacity": loop.capacity, "can_be_sampled": _can_be_sampled(loop)} | result)
-            print(timing.line(f"{what}, {loop.capacity:,} transitions", rows[-1]), flush=True)
+    for what, contestants in (("learn", learning), ("sample_batch", sampling)):
+        for capacity, result in timing.take_turns(contestants, effort).items():
+            rows.append({"what": what, "capacity": capacity, "can_be_sampled": _can_be_sampled(loops[capacity])} | result)
+            print(timing.line(f"{what}, {capacity:,} transitions", rows[-1]), flush=True)
         for clock in ("cpu", "wall"):
-            print(f"  {part}: {clock} time with the large one / with the small one = {_ratio(rows, part, clock):.3f}", flush=True)
+            print(f"  {what}: {clock} time with the large one / with the small one = {_ratio(rows, what, clock):.3f}", flush=True)
 
     row = {
         "what": "memory",
@@ -83,20 +76,16 @@ def tables(rows: list[Row]) -> str:
     """Costs by size, their ratio, and the memory."""
     config = hindrl_jax.preset("hindrl")
     names = {"learn": "one gradient step, whole loop", "sample_batch": "drawing one batch alone"}
-    all_names = names | {
-        "learn_prioritised": "one gradient step, whole loop, with priorities",
-        "sample_batch_prioritised": "drawing one batch alone by priorities, which are then assigned again",
-    }
     lines = [
         [
-            all_names[row["what"]],
+            names[row["what"]],
             f"{row['capacity']:,}",
             f"{row['can_be_sampled']:,}",
             timing.milliseconds(row, "cpu"),
             timing.milliseconds(row, "wall"),
         ]
         for row in rows
-        if row["what"] in all_names
+        if row["what"] in names
     ]
     text = (
         f"The default recipe (batch {config.batch.batch_size}, {config.num_envs} environments) with a full replay. Two episodes per environment are "

@@ -56,7 +56,6 @@ class Transition(struct.PyTreeNode, kw_only=True):
     desired_goal: Array  # (B, G)
     is_demonstration: Array  # (B,) bool
     is_relabelled: Array  # (B,) bool, whether the goal, or the observations, are those of hindsight
-    weight: Array | None = None  # (B,), in [0, 1], of the row in the critics' loss; None for equal weights
 
 
 def tree_where(condition: Array, if_true: Any, if_false: Any) -> Any:

@@ -8,7 +8,6 @@ from hindrl_jax.config.agent import RESIDUAL_EXPANSION, AgentConfig
 from hindrl_jax.config.batch import BatchConfig, Source, Strategy
 from hindrl_jax.config.conditions import without_effect
 from hindrl_jax.config.goal import GoalConfig
-from hindrl_jax.config.priority import PriorityConfig
 from hindrl_jax.config.quirks import QuirksConfig
 from hindrl_jax.config.sweeps import SWEEPABLE, sweepable_value, with_traced_values, with_values
 from hindrl_jax.config.train import Algorithm, TrainConfig
@@ -18,7 +17,6 @@ __all__ = [
     "Algorithm",
     "BatchConfig",
     "GoalConfig",
-    "PriorityConfig",
     "QuirksConfig",
     "RESIDUAL_EXPANSION",
     "SWEEPABLE",

@@ -20,7 +20,7 @@ def _relabels_with_demonstrations(config: TrainConfig) -> bool:
 
 
 def _has_demo_rows(config: TrainConfig) -> bool:
-    return not config.learns_from_rollouts or config.batch.max_demo_rows > 0 or config.priority.is_used
+    return not config.learns_from_rollouts or config.batch.max_demo_rows > 0
 
 
 def _clones(config: TrainConfig) -> bool:
@@ -31,7 +31,7 @@ def _clones(config: TrainConfig) -> bool:
 CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
     (
         "max_demo_ratio reach_zero relabelled_per_original hindrl_sampling_strategy union_sampling_ratio intersection_goals "
-        "n_step gamma bootstrap_past_relabelled_goals timeouts_are_terminal importance_exponent demo_priority_bonus "
+        "n_step gamma bootstrap_past_relabelled_goals timeouts_are_terminal "
         "achieved_goal_ratio clip_targets num_critics num_target_critics num_quantiles top_quantiles_to_drop_per_net "
         "layer_norm target_update_rate initial_alpha target_entropy final_target_entropy bc_weight agent_resets num_envs "
         "updates_per_iteration learning_starts buffer_size demo_reset_ratio demo_reset_curriculum",
@@ -65,8 +65,6 @@ CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
         _relabels_with_demonstrations,
         "nothing is relabelled with goals of demonstrations: choose --algo hindrl with --hindrl-sampling-strategy task_conditioned",
     ),
-    ("importance_exponent demo_priority_bonus", lambda c: c.priority.is_used, "transitions have no priorities: raise --priority-exponent"),
-    ("max_demo_ratio", lambda c: not c.priority.is_used, "the share of demonstrations follows from their priorities: set --priority-exponent 0"),
     ("reach_zero", lambda c: c.batch.max_demo_rows > 0, "the batch has no demonstration rows: raise --max-demo-ratio"),
     ("bc_weight q_filter", _has_demo_rows, "the batch has no demonstration rows to clone: raise --max-demo-ratio"),
     (

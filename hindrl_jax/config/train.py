@@ -9,7 +9,6 @@ from hindrl_jax.base.checks import check, check_types
 from hindrl_jax.config.agent import AgentConfig
 from hindrl_jax.config.batch import BatchConfig
 from hindrl_jax.config.goal import GoalConfig
-from hindrl_jax.config.priority import PriorityConfig
 from hindrl_jax.config.quirks import QuirksConfig
 
 STEPS_PER_UPDATE = 4
@@ -66,7 +65,6 @@ class TrainConfig:
     batch: BatchConfig = dataclasses.field(default_factory=BatchConfig)
     goal: GoalConfig = dataclasses.field(default_factory=GoalConfig)
     agent: AgentConfig = dataclasses.field(default_factory=AgentConfig)
-    priority: PriorityConfig = dataclasses.field(default_factory=PriorityConfig)
     quirks: QuirksConfig = dataclasses.field(default_factory=QuirksConfig)
 
     def __post_init__(self) -> None:
@@ -94,8 +92,7 @@ class TrainConfig:
             raise ValueError("action_chunks = True is of no use while action_hold = 1: raise that, too, or set it to None")
         if self.algo == "bc":
             given: dict[str, Any] = {"bc_warm_start": self.bc_warm_start, "imitation_proposal": self.imitation_proposal}
-            given |= {"q_filter": self.agent.q_filter != "off" and self.agent.q_filter}
-            given |= {"priority_exponent": self.priority.priority_exponent, "base": self.agent.base != "tqc" and self.agent.base}
+            given |= {"q_filter": self.agent.q_filter != "off" and self.agent.q_filter, "base": self.agent.base != "tqc" and self.agent.base}
             for name, value in given.items():
                 if value:
                     raise ValueError(f"{name} = {value} has no effect on bc, which is behaviour cloning alone: drop it, or choose another algo")
@@ -105,11 +102,6 @@ class TrainConfig:
             )
         if self.algo == "smooth-hindrl" and not self.goal.epsilon_filtering:
             raise ValueError("smooth-hindrl is hindrl with epsilon_filtering, which is off: turn it on, or choose hindrl")
-        if self.batch.reach_zero is not None and self.priority.is_used:
-            raise ValueError(
-                f"reach_zero = {self.batch.reach_zero} is of no use with priority_exponent = {self.priority.priority_exponent}, by which the share "
-                "of demonstrations follows from their priorities: set one of them to None or 0"
-            )
 
     @property
     def num_held(self) -> int:

@@ -105,7 +105,6 @@ class _Columns(struct.PyTreeNode, kw_only=True):
     reward: Array  # (B,)
     discount: Array  # (B,)
     is_demonstration: Array  # (B,) bool
-    weight: Array | None  # (B,)
     noise: Array  # (A, B) standard normal, for the sampled action
     next_noise: Array  # (A, B) the same for the next action
 
@@ -121,7 +120,7 @@ def update(key: Array, state: AgentState, batch: Transition, schedule: Schedule,
     Args:
       key: random key.
       state: the agent.
-      batch: B transitions; their weights, if they have any, are those of the critics' losses.
+      batch: B transitions.
       schedule: see `schedules.schedule`.
       config: static.
 
@@ -143,13 +142,6 @@ def update(key: Array, state: AgentState, batch: Transition, schedule: Schedule,
     return state, {**critic_metrics, **actor_metrics, **alpha_metrics, "batch/reward": jnp.sum(batch.reward)}
 
 
-def td_error(key: Array, state: AgentState, batch: Transition, config: TrainConfig) -> Array:
-    """How far the critics are from their targets: |mean of all critics' atoms - mean of the targets|, (B,), not weighted; args as for `update`."""
-    columns, target_critics = _prepare(key, state, batch, config)
-    values = mean_return(state.critics, columns.inputs, columns.action, config.agent)
-    return jnp.abs(values - jnp.mean(_targets(state, target_critics, config, columns), axis=0))
-
-
 def _prepare(key: Array, state: AgentState, batch: Transition, config: TrainConfig) -> tuple[_Columns, Params]:
     """The batch in columns, with the noise of its actions, and the target critics that are asked."""
     key_actor, key_next, key_critics = jax.random.split(key, 3)
@@ -164,7 +156,6 @@ def _prepare(key: Array, state: AgentState, batch: Transition, config: TrainConf
         reward=batch.reward,
         discount=batch.discount,
         is_demonstration=batch.is_demonstration,
-        weight=batch.weight,
         noise=jax.random.normal(key_actor, action.shape),
         next_noise=jax.random.normal(key_next, action.shape),
     )
@@ -205,7 +196,7 @@ def _critic_gradient(state: AgentState, target_critics: Params, config: TrainCon
     def loss(critics: Params) -> tuple[Array, Metrics]:
         quantiles = apply_critics(critics, block.inputs, block.action, config.agent)
         errors = quantile_huber(quantiles, targets) if config.agent.base == "tqc" else squared_error(quantiles[:, 0], targets[0])
-        value = jnp.mean(errors if block.weight is None else errors * block.weight[None])
+        value = jnp.mean(errors)
         return value, {"critic/loss": value, "critic/value": jnp.mean(quantiles), "critic/target": jnp.mean(targets)}
 
     return jax.grad(loss, has_aux=True)(state.critics)

@@ -82,7 +82,7 @@ def add(replay: ReplayState, recorded: RecordedStep) -> ReplayState:
     """Appends one transition per environment; an episode becomes available for sampling when it ends. The caller donates the old state."""
     slots = slots_per_env(replay)
     step, ended = replay.step, recorded.terminated | recorded.truncated
-    row = written_rows(replay)
+    row = jnp.arange(step.shape[0]) * slots + replay.slot
     episodes = replay.episodes
     return ReplayState(
         episodes=episodes.replace(
@@ -103,11 +103,6 @@ def add(replay: ReplayState, recorded: RecordedStep) -> ReplayState:
 def slots_per_env(replay: ReplayState) -> int:
     """R, the slots in the ring of each environment."""
     return replay.episodes.lengths.shape[0] // replay.slot.shape[0]
-
-
-def written_rows(replay: ReplayState) -> Array:
-    """(E,) int32, the rows of `episodes` that the environments are writing."""
-    return jnp.arange(replay.slot.shape[0]) * slots_per_env(replay) + replay.slot
 
 
 def sample_episodes(key: Array, replay: ReplayState, num_samples: int) -> Array:

@@ -1,13 +1,12 @@
 """Training as pure functions over one state: collect, learn (or clone), evaluate. The Python loop over jitted chunks is the caller's.
 
 The chain relabel -> batch -> update is one program. The batches of an iteration are drawn together, in one read of the replay, before the scan
-over its gradient steps. How they are drawn is a `Sampler`, uniform by default.
+over its gradient steps.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple, cast
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +35,6 @@ class TrainState(struct.PyTreeNode, kw_only=True):
     agent: AgentState
     replay: ReplayState
     rollout: RolloutState
-    sampler: Any  # what the `Sampler` keeps; nothing for the uniform one
     curriculum: Curriculum | None = None  # how far back in the demonstrations episodes begin; None without `demo_reset_curriculum`
     key: Array
     env_steps: Array  # () int32
@@ -45,39 +43,13 @@ class TrainState(struct.PyTreeNode, kw_only=True):
     updates_at_reset: Array  # () int32 updates when it last did, or 0
 
 
-class Sampler(NamedTuple):
-    """How the batches of an iteration are drawn, and what is kept for that along the run."""
-
-    init: Callable[[Guidance, ReplayState], Any]
-    """(guidance, empty replay) -> what is kept."""
-    record: Callable[[Any, ReplayState, ReplayState], Any]
-    """(what is kept, replay before a step of all environments, after it) -> what is kept."""
-    draw: Callable[[Array, TrainState, Guidance], tuple[Transition, Any]]
-    """(key, state, guidance) -> `num_updates` batches, leaves (U, B, ...), and what `learned` needs to know of them."""
-    learned: Callable[[TrainState, Transition, Any], Any]
-    """(state after the gradient steps, the batches, what was said of them) -> what is kept."""
-
-
-def uniform_sampler(env: Environment, config: TrainConfig) -> Sampler:
-    """Draws episodes uniformly, then one of their transitions, see `batch.sample_batch`."""
-
-    def draw(key: Array, state: TrainState, guidance: Guidance) -> tuple[Transition, Any]:
-        keys = jax.random.split(key, config.num_updates)
-        return jax.vmap(lambda key: sample_batch(key, state.replay, guidance, state.env_steps, env, config))(keys), ()
-
-    return Sampler(init=lambda *_: (), record=lambda *_: (), draw=draw, learned=lambda *_: ())
-
-
-def init(
-    key: Array, guidance: Guidance, env: Environment, config: TrainConfig, *, sampler: Sampler | None = None, begun: RolloutState | None = None
-) -> TrainState:
+def init(key: Array, guidance: Guidance, env: Environment, config: TrainConfig, *, begun: RolloutState | None = None) -> TrainState:
     """A fresh agent, an empty replay and `num_envs` episodes about to begin.
 
     Args:
       key: random key.
       guidance: from `guidance.guidance`.
       env, config: static.
-      sampler: how batches will be drawn.
       begun: the episodes, where they have begun outside JAX.
 
     Raises:
@@ -90,12 +62,10 @@ def init(
     begins = curriculum.init(guidance.starts.lengths) if config.demo_reset_curriculum else None
     if begun is None:
         begun = _new_episodes(key_rollout, guidance, cast(Steppable, env), config, begins)
-    empty = replay.init(env, num_envs=config.num_envs, capacity=capacity, notes=notes)
     return TrainState(
         agent=agents.init(key_agent, guidance.scale, config, action_dim=env.action_dim),
-        replay=empty,
+        replay=replay.init(env, num_envs=config.num_envs, capacity=capacity, notes=notes),
         rollout=_with_notes(begun, config),
-        sampler=() if sampler is None else sampler.init(guidance, empty),
         curriculum=begins,
         key=key_train,
         env_steps=jnp.zeros((), jnp.int32),
@@ -232,41 +202,37 @@ def continue_from(key: Array, state: TrainState, after: RolloutState, time_step:
     return state.replace(rollout=after, env_steps=state.env_steps + config.steps_per_iteration)
 
 
-def collect(
-    state: TrainState, guidance: Guidance, *, env: Steppable, config: TrainConfig, num_iterations: int, sampler: Sampler | None = None
-) -> TrainState:
+def collect(state: TrainState, guidance: Guidance, *, env: Steppable, config: TrainConfig, num_iterations: int) -> TrainState:
     """Fills the replay by uniformly random actions: `num_iterations` steps of every environment."""
-    sampler = sampler or uniform_sampler(env, config)
 
     def iteration(state: TrainState, _: None) -> tuple[TrainState, None]:
         key, key_interact = jax.random.split(state.key)
-        after = _interact(key_interact, state.replace(key=key), guidance, env, config, act_at_random(env))
-        return after.replace(sampler=sampler.record(state.sampler, state.replay, after.replay)), None
+        return _interact(key_interact, state.replace(key=key), guidance, env, config, act_at_random(env)), None
 
     return jax.lax.scan(iteration, state, length=num_iterations)[0]
 
 
-def learn(
-    state: TrainState, guidance: Guidance, *, env: Steppable, config: TrainConfig, num_iterations: int, sampler: Sampler | None = None
-) -> tuple[TrainState, Metrics]:
+def learn(state: TrainState, guidance: Guidance, *, env: Steppable, config: TrainConfig, num_iterations: int) -> tuple[TrainState, Metrics]:
     """`num_iterations` times: one step of every environment, then `num_updates` gradient steps.
 
     Returns:
       The new state, and metrics averaged over the gradient steps.
     """
-    sampler = sampler or uniform_sampler(env, config)
 
     def iteration(state: TrainState, _: None) -> tuple[TrainState, Metrics]:
         key, key_interact, key_batch, key_updates = jax.random.split(state.key, 4)
         act = make_policy(agents.policy(state.agent, average=False), env, config)
-        after = _interact(key_interact, state.replace(key=key), guidance, env, config, act)
-        state = after.replace(sampler=sampler.record(state.sampler, state.replay, after.replay))
-        batches, drawn = sampler.draw(key_batch, state, guidance)
-        state, metrics = gradient_steps(key_updates, state, batches, env, config)
-        return state.replace(sampler=sampler.learned(state, batches, drawn)), metrics
+        state = _interact(key_interact, state.replace(key=key), guidance, env, config, act)
+        return gradient_steps(key_updates, state, draw_batches(key_batch, state, guidance, env, config), env, config)
 
     state, metrics = jax.lax.scan(iteration, _reset_agent_if_due(state, env, config), length=num_iterations)
     return state, jax.tree.map(jnp.mean, metrics)
+
+
+def draw_batches(key: Array, state: TrainState, guidance: Guidance, env: Environment, config: TrainConfig) -> Transition:
+    """The batches of an iteration's gradient steps, leaves (U, B, ...), see `batch.sample_batch`."""
+    keys = jax.random.split(key, config.num_updates)
+    return jax.vmap(lambda key: sample_batch(key, state.replay, guidance, state.env_steps, env, config))(keys)
 
 
 def gradient_steps(key: Array, state: TrainState, batches: Transition, env: Environment, config: TrainConfig) -> tuple[TrainState, Metrics]:

@@ -164,12 +164,6 @@ OPTIONS: tuple[Option, ...] = (
     Option("no-actor-average", "actor", "the actor itself is evaluated, not its running average", (("agent.actor_average_span", 0.0),)),
     Option("inputs-raw", "inputs", "networks see inputs as they are (thesis)", (("agent.input_encoding", "raw"),)),
     Option("inputs-standardised", "inputs", "networks see standardised inputs", (("agent.input_encoding", "standardised"),)),
-    Option(
-        "prioritised",
-        "replay",
-        "rows drawn by their errors, those of demonstrations with a bonus, which leaves few of them (prioritised replay; DDPGfD)",
-        (("priority.priority_exponent", 0.6), ("priority.demo_priority_bonus", 1.0)),
-    ),
     Option("batch-1024", "replay", "batches of 1,024 rows in place of 256", (("batch.batch_size", 1_024),)),
     Option(
         "environments-64",

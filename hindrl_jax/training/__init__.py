@@ -10,6 +10,5 @@ Environments are asked what they can do (`hindrl_jax.base`), never of what kind 
     host            the same for environments that are stepped outside JAX
     playing         episodes by an expert or by trained policies, wherever they are stepped; host_playing outside JAX
     recording       record_demonstrations, record_gymnasium
-    prioritised     prioritised replay, as a sampler for the core
     devices         the seed axis spread over devices
 """

@@ -29,7 +29,6 @@ from hindrl_jax.core.rollout import Evaluation, RolloutState
 from hindrl_jax.core.train import TrainState
 from hindrl_jax.training.devices import by_seed, shapes_on
 from hindrl_jax.training.host_playing import HostPolicies, evaluate, with_goals_of
-from hindrl_jax.training.prioritised import sampler_for
 from hindrl_jax.training.programs import Programs, start, warm_start
 
 
@@ -222,14 +221,11 @@ def remember(
     ended = time_step.terminated | time_step.truncated
     goal = jnp.where(ended[:, None], now.desired_goal, before.desired_goal)  # within an episode it may be one that was chosen here
     after = now.replace(desired_goal=goal, notes={name: noted & ~ended for name, noted in before.notes.items()})
-    recorded = training.record(plan.key_nearby, state, (plan.action, time_step), guidance, env, config)
-    kept = sampler_for(env, config).record(state.sampler, state.replay, recorded.replay)
-    return training.continue_from(plan.key_goals, recorded.replace(sampler=kept), after, time_step, env, config)
+    state = training.record(plan.key_nearby, state, (plan.action, time_step), guidance, env, config)
+    return training.continue_from(plan.key_goals, state, after, time_step, env, config)
 
 
 def improve(state: TrainState, plan: Plan, guidance: Guidance, *, env: Environment, config: TrainConfig) -> tuple[TrainState, Metrics]:
     """The gradient steps of an iteration."""
-    sampler = sampler_for(env, config)
-    batches, drawn = sampler.draw(plan.key_batch, state, guidance)
-    state, metrics = training.gradient_steps(plan.key_updates, state, batches, env, config)
-    return state.replace(sampler=sampler.learned(state, batches, drawn)), metrics
+    batches = training.draw_batches(plan.key_batch, state, guidance, env, config)
+    return training.gradient_steps(plan.key_updates, state, batches, env, config)

@@ -27,7 +27,6 @@ from hindrl_jax.core.rollout import Evaluation, RolloutState
 from hindrl_jax.core.train import TrainState
 from hindrl_jax.training.checks import steps_to_learn, swept_fields
 from hindrl_jax.training.devices import free_memory, over_seeds, seed_mesh, shapes_on, spread, tree_bytes
-from hindrl_jax.training.prioritised import sampler_for
 
 FRESH_EPISODES = 100
 """Episodes of the evaluation of a finished run."""
@@ -149,13 +148,13 @@ class JaxPrograms(Programs):
         with self._compiler() as compile_:
             starting, guidance, state, key = self._trace_start(start, *given, None, values)
             actor, rest = policy(state.agent, average=True), (guidance, values)
-            function = learn if config.learns_from_rollouts else training.clone
+            function = training.learn if config.learns_from_rollouts else training.clone
             pending = {"learn": compile_(self._trace(function, state, *rest, donate=True, num_iterations=self.chunk))}
             pending["start"] = compile_(starting, **_RUN_ONCE)
             for num_episodes in {config.eval_episodes, FRESH_EPISODES}:
                 pending[f"evaluate {num_episodes}"] = compile_(self._trace(evaluate, key, actor, *rest, num_episodes=num_episodes))
             if config.learns_from_rollouts:
-                pending["collect"] = compile_(self._trace(collect, state, *rest, donate=True, num_iterations=self.warm_up), **_RUN_ONCE)
+                pending["collect"] = compile_(self._trace(training.collect, state, *rest, donate=True, num_iterations=self.warm_up), **_RUN_ONCE)
             if config.clones_first:
                 pending["warm_start"] = compile_(self._trace(warm_start, state, *rest, donate=True))
             self._programs = {name: program.result() for name, program in pending.items()}
@@ -195,17 +194,7 @@ def start(
     """Guidance, state, and the key of evaluations; `begun` are the first episodes where they have begun outside JAX."""
     key_init, key_evaluate = jax.random.split(jax.random.key(seed))
     guidance = guidance_of(demonstrations, env, config)
-    return guidance, training.init(key_init, guidance, env, config, sampler=sampler_for(env, config), begun=begun), key_evaluate
-
-
-def collect(state: TrainState, guidance: Guidance, *, env: Steppable, config: TrainConfig, num_iterations: int) -> TrainState:
-    """Steps at random."""
-    return training.collect(state, guidance, env=env, config=config, num_iterations=num_iterations, sampler=sampler_for(env, config))
-
-
-def learn(state: TrainState, guidance: Guidance, *, env: Steppable, config: TrainConfig, num_iterations: int) -> tuple[TrainState, Metrics]:
-    """Iterations of learning from rollouts."""
-    return training.learn(state, guidance, env=env, config=config, num_iterations=num_iterations, sampler=sampler_for(env, config))
+    return guidance, training.init(key_init, guidance, env, config, begun=begun), key_evaluate
 
 
 def warm_start(state: TrainState, guidance: Guidance, *, env: Environment, config: TrainConfig) -> TrainState:

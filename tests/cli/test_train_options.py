@@ -54,7 +54,7 @@ def test_every_config_field_is_a_flag(capsys):
     printed = capsys.readouterr().out
     config = preset()
     sections = [section for section in vars(config).values() if dataclasses.is_dataclass(section)]
-    assert len(sections) == 5
+    assert len(sections) == 4
     for part in (config, *sections, make("FixedGridPickAndPlace")):
         for field in dataclasses.fields(part):
             assert dataclasses.is_dataclass(getattr(part, field.name)) or f"--{field.name.replace('_', '-')}" in printed, field.name
@@ -64,7 +64,7 @@ def test_quirks_come_last_in_the_help(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")  # one column
     with pytest.raises(SystemExit):
         cli.main(["train", "--help"])
-    assert re.findall(r"(training\.\w+) options", capsys.readouterr().out)[-3:] == ["training.agent", "training.priority", "training.quirks"]
+    assert re.findall(r"(training\.\w+) options", capsys.readouterr().out)[-2:] == ["training.agent", "training.quirks"]
 
 
 def test_flags_of_each_type():

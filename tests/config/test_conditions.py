@@ -95,9 +95,6 @@ VALUES = {
     "bc_weight": (0.1, 0.2),
     "q_filter": ("hard", "smooth"),
     "input_encoding": ("raw", "multiscale"),
-    "priority_exponent": (0.5, 0.6),
-    "importance_exponent": (0.6, 0.7),
-    "demo_priority_bonus": (1.0, 2.0),
     "strict_goal_test": (True, False),
     "bootstrap_past_relabelled_goals": (True, False),
     "timeouts_are_terminal": (True, False),
@@ -110,7 +107,7 @@ VALUES = {
 }
 SECTIONS = {
     field.name: section
-    for section in ("", "batch", "goal", "agent", "priority", "quirks")
+    for section in ("", "batch", "goal", "agent", "quirks")
     for field in dataclasses.fields(getattr(SMALL, section) if section else SMALL)
     if not dataclasses.is_dataclass(getattr(getattr(SMALL, section) if section else SMALL, field.name))
 }
@@ -165,9 +162,7 @@ BASES = {
         "joint_union with sac and one critic": dict(hindrl_sampling_strategy="joint_union", base="sac", num_critics=1),
         "joint_intersection": dict(hindrl_sampling_strategy="joint_intersection"),
         "future with redq, residual": dict(hindrl_sampling_strategy="future", residual=True, num_critics=3, num_target_critics=2, epsilon=0.1),
-        "the other joint_intersection with priorities": dict(
-            hindrl_sampling_strategy="joint_intersection", intersection_goals="demonstrations", priority_exponent=0.5
-        ),
+        "the other joint_intersection": dict(hindrl_sampling_strategy="joint_intersection", intersection_goals="demonstrations"),
         "no relabelling": dict(relabelled_per_original=0.0, final_target_entropy=None),
         "no demonstration rows": dict(max_demo_ratio=0.0),
         "no demonstration rows, a warm start": dict(max_demo_ratio=0.0, bc_warm_start=1),
@@ -202,9 +197,8 @@ def test_every_field_is_tried_and_every_condition_both_ways():
     tried = [claims(config) for config in BASES.values()]
     assert VALUES.keys() - {name for effective, _ in tried for name in effective} == set()
     with_a_condition = {name for names, _, _ in CONDITIONS for name in names.split()}
-    # Where they would have no effect, the config refuses these.
-    refused = {"demo_priority_bonus", "demo_reset_curriculum"}
-    assert with_a_condition - {name for _, ineffective in tried for name in ineffective} == refused
+    # Where it would have no effect, the config refuses this one.
+    assert with_a_condition - {name for _, ineffective in tried for name in ineffective} == {"demo_reset_curriculum"}
 
 
 def test_equal_configs_have_equal_programs():

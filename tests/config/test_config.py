@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 import hindrl_jax
-from hindrl_jax.config import AgentConfig, BatchConfig, GoalConfig, PriorityConfig, QuirksConfig, TrainConfig, without_effect
+from hindrl_jax.config import AgentConfig, BatchConfig, GoalConfig, QuirksConfig, TrainConfig, without_effect
 
 SOURCES = [path for path in Path(hindrl_jax.__file__).parent.rglob("*.py") if path.parent.name != "config"]
-CONFIGS = (BatchConfig, GoalConfig, AgentConfig, PriorityConfig, QuirksConfig, TrainConfig)
+CONFIGS = (BatchConfig, GoalConfig, AgentConfig, QuirksConfig, TrainConfig)
 FIELDS = [(part, field.name) for part in CONFIGS for field in dataclasses.fields(part)]
-SECTIONS = ("batch", "goal", "agent", "priority", "quirks")
+SECTIONS = ("batch", "goal", "agent", "quirks")
 # Derived in the config itself and read elsewhere under another name.
 READ_THROUGH = {
     "max_demo_ratio": "max_demo_rows",
@@ -82,9 +82,6 @@ BAD = [
     (BatchConfig, "intersection_goals", ["both"]),
     (BatchConfig, "n_step", [0, None]),
     (BatchConfig, "gamma", [0.0, 1.01, float("inf")]),
-    (PriorityConfig, "priority_exponent", [-0.1, 1.1, float("nan"), None]),
-    (PriorityConfig, "importance_exponent", [-0.1, 1.1, None]),
-    (PriorityConfig, "demo_priority_bonus", [-0.1, float("inf"), "1", 0.5]),  # 0.5 while transitions are drawn uniformly
     (GoalConfig, "epsilon_steps", [-1, 0.5]),
     (GoalConfig, "epsilon_deviations", [-0.1, float("nan")]),
     (GoalConfig, "epsilon", [-0.1, float("nan"), "0.1"]),
@@ -137,7 +134,6 @@ BAD = [
     (TrainConfig, "batch", [None, {}, AgentConfig()]),
     (TrainConfig, "goal", [None]),
     (TrainConfig, "agent", [None]),
-    (TrainConfig, "priority", [None, 0.5]),
     (TrainConfig, "quirks", [None, True]),
 ]
 
@@ -146,11 +142,6 @@ BAD = [
 def test_bad_values_are_named(config, name, value):
     with pytest.raises(ValueError, match=rf"\b{name} = "):
         config(**{name: value})
-
-
-def test_the_share_of_demonstrations_follows_from_priorities_or_from_the_steps():
-    with pytest.raises(ValueError, match=r"reach_zero = 10 is of no use with priority_exponent = 0\.6.*set one of them to None or 0"):
-        TrainConfig(batch=BatchConfig(reach_zero=10), priority=PriorityConfig(priority_exponent=0.6))
 
 
 def test_epsilon_is_given_or_found_but_not_both():
@@ -170,7 +161,6 @@ def test_the_table_of_bad_values_is_complete():
         lambda: AgentConfig(num_quantiles=25, top_quantiles_to_drop_per_net=24, target_entropy=-3.0, bc_weight=0, net_arch=(1,)),
         lambda: TrainConfig(algo="bc", steps=1, learning_starts=5),  # cloning takes no environment steps
         lambda: TrainConfig(demo_reset_ratio=1),
-        lambda: PriorityConfig(priority_exponent=1, importance_exponent=0, demo_priority_bonus=100),
     ],
 )
 def test_values_at_the_edge_are_accepted(build):
@@ -201,7 +191,6 @@ def test_the_algorithm_must_fit_its_settings(fitting, contradiction, name):
         dict(imitation_proposal=1),
         dict(agent=AgentConfig(q_filter="hard")),
         dict(agent=AgentConfig(base="sac")),
-        dict(priority=PriorityConfig(priority_exponent=0.5)),
     ],
 )
 def test_cloning_alone_refuses_what_it_would_ignore(changes):
@@ -242,7 +231,6 @@ def test_sources_of_relabelled_goals_by_hand(changes, sources):
         ({"batch": {"relabelled_per_original": 0.0}}, "hindrl_sampling_strategy", "nothing is relabelled"),
         ({"batch": {"max_demo_ratio": 0.0}}, "bc_loss", "no demonstration rows to clone"),
         ({"batch": {"max_demo_ratio": 0.0}, "bc_warm_start": 1}, "bc_loss", None),
-        ({"batch": {"max_demo_ratio": 0.0}, "priority": {"priority_exponent": 0.5}}, "bc_loss", None),
         ({"agent": {"bc_weight": 0.0}}, "bc_action", "nothing is cloned"),
         ({"algo": "bc"}, "bc_action", None),
         ({}, "learning_rate", None),

@@ -12,7 +12,6 @@ from hindrl_jax.config import sweepable_value, with_traced_values
 from hindrl_jax.config.sweeps import SWEEPABLE
 from hindrl_jax.core import agent, train
 from hindrl_jax.core.guidance import guidance
-from hindrl_jax.training.prioritised import sampler_for
 from hindrl_jax.training.programs import warm_start
 
 ENV, DEMONSTRATIONS = Corridor(), corridor_demonstrations()
@@ -31,8 +30,7 @@ class Stages:
         self.config = config
 
     def given(self, values):
-        actual = with_traced_values(self.config, values)
-        return dict(env=ENV, config=actual, sampler=sampler_for(ENV, actual))
+        return dict(env=ENV, config=with_traced_values(self.config, values))
 
     def take(self, values, key, demonstrations):
         return key, guidance(demonstrations, ENV, with_traced_values(self.config, values))
@@ -44,24 +42,21 @@ class Stages:
         return train.collect(state, data, **self.given(values), num_iterations=train.warm_up_iterations(ENV, self.config)), data
 
     def warm_up(self, values, state, data):
-        return warm_start(state, data, **self.without_sampler(values)), data
-
-    def without_sampler(self, values):
-        return {name: value for name, value in self.given(values).items() if name != "sampler"}
+        return warm_start(state, data, **self.given(values)), data
 
     def clone(self, values, state, data):
-        return agent.policy(train.clone(state, data, **self.without_sampler(values), num_iterations=2)[0].agent, average=True)
+        return agent.policy(train.clone(state, data, **self.given(values), num_iterations=2)[0].agent, average=True)
 
     def learn(self, values, state, data):
         return agent.policy(train.learn(state, data, **self.given(values), num_iterations=2)[0].agent, average=True)
 
     def draw(self, values, state, data):
         """The first half of what `learn` does after a step of the environments."""
-        return self.given(values)["sampler"].draw(state.key, state, data)[0], state
+        return train.draw_batches(state.key, state, data, **self.given(values)), state
 
     def descend(self, values, batches, state):
         """The second half."""
-        return agent.policy(train.gradient_steps(state.key, state, batches, **self.without_sampler(values))[0].agent, average=True)
+        return agent.policy(train.gradient_steps(state.key, state, batches, **self.given(values))[0].agent, average=True)
 
     def whole(self, values, key, demonstrations):
         carry = self.begin(values, *self.take(values, key, demonstrations))

@@ -235,7 +235,7 @@ def test_an_update_in_blocks_is_the_same_update(monkeypatch):
         observation=rng.normal(size=(B, 2)),
         next_observation=rng.normal(size=(B, 2)),
         is_demonstration=np.arange(B) < 5,
-    ).replace(weight=jnp.asarray(rng.uniform(size=B), jnp.float32))
+    )
     start = fresh_agent(jax.random.key(0), config)
     asked = []
 

@@ -2,7 +2,6 @@
 
 import itertools
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -39,7 +38,7 @@ def columns(**given):
     """A batch of B columns of zeros, but for what is given."""
     zero, row = jnp.zeros(B), jnp.zeros((1, B))
     zeros = dict(inputs=jnp.zeros((3, B)), next_inputs=jnp.zeros((3, B)), action=row, noise=row, next_noise=row, reward=zero, discount=zero)
-    return agents._Columns(**(zeros | dict(is_demonstration=jnp.zeros(B, bool), weight=None) | given))
+    return agents._Columns(**(zeros | dict(is_demonstration=jnp.zeros(B, bool)) | given))
 
 
 @pytest.mark.parametrize("base", BASES)
@@ -82,44 +81,22 @@ def test_the_value_that_the_actor_climbs(base, value):
 
 
 @pytest.mark.parametrize(
-    ("config", "constants", "targets", "expected"),
-    # Rows have rewards 0.5 and 4.5, and discount 0.5. Quantiles have the mean 2. Targets are 0.5 (-1, 0, 1, 2) = 0.25 on average, more than the
-    # reward: 0.75 and 4.75. Clipped to [0, 1] they are (0, 0.5, 1, 1) = 0.625 and 1; with the four largest of eight dropped -0.25 more than it.
+    ("config", "constants", "expected"),
+    # Rows have rewards 0.5 and 4.5, and discount 0.5. Half of (-1, 0, 1, 2) is 0.25 on average, which is added to the reward: 0.75 and 4.75.
+    # Clipped to [0, 1] these targets are (0, 0.5, 1, 1) = 0.625 and 1; with the four largest of eight dropped -0.25 is added.
     [
-        (CONFIG, [[0.0, 1.0, 2.0, 3.0], [1.0, 2.0, 3.0, 4.0]], [[-1.0, 0.0, 1.0, 2.0]] * 2, (1.25, 2.75)),
-        (with_agent(clip_targets=True), [[0.0, 1.0, 2.0, 3.0], [1.0, 2.0, 3.0, 4.0]], [[-1.0, 0.0, 1.0, 2.0]] * 2, (1.375, 1.0)),
-        (with_agent(top_quantiles_to_drop_per_net=2), [2.0, 2.0], [[-1.0, 0.0, 1.0, 2.0]] * 2, (1.75, 2.25)),
-        (BASES["sac"], [3.0, 1.0], [-1.0, 5.0], (2.0, 2.0)),  # the mean of the critics, 2, and the least of the targets: 0 and 4
+        (CONFIG, [[-1.0, 0.0, 1.0, 2.0]] * 2, (0.75, 4.75)),
+        (with_agent(clip_targets=True), [[-1.0, 0.0, 1.0, 2.0]] * 2, (0.625, 1.0)),
+        (with_agent(top_quantiles_to_drop_per_net=2), [[-1.0, 0.0, 1.0, 2.0]] * 2, (0.25, 4.25)),
+        (BASES["sac"], [-1.0, 5.0], (0.0, 4.0)),  # the least of the two critics
     ],
 )
-def test_temporal_difference_errors_by_hand(config, constants, targets, expected):
+def test_targets_of_each_row_by_hand(config, constants, expected):
     start = fresh_agent(jax.random.key(0), config).replace(log_alpha=jnp.asarray(-30.0))
-    start = with_constant_critics(with_constant_critics(start, constants, target=False), targets)
-    batch = make_batch(action=ACTIONS, reward=np.tile([0.5, 4.5], B // 2), discount=0.5).replace(weight=jnp.full(B, 0.1))  # weights play no part
-    errors = jax.jit(lambda key: agents.td_error(key, start, batch, config))(jax.random.key(0))
-    np.testing.assert_allclose(errors, np.tile(expected, B // 2), atol=1e-5)
-
-
-def test_rows_count_in_the_critics_loss_by_their_weights():
-    # Half the squared distance of 3 and 1 to the reward: (2 + 0) / 2 = 1 where that is 1, (0.5 + 0.5) / 2 = 0.5 where it is 2.
-    start = with_constant_critics(fresh_agent(jax.random.key(0), BASES["sac"]), [3.0, 1.0], target=False)
-    batch = make_batch(action=ACTIONS, reward=np.tile([1.0, 2.0], B // 2), discount=0.0)
-    losses = {}
-    for name, weight in (("none", None), ("ones", [1.0, 1.0]), ("some", [1.0, 0.25])):
-        weighted = batch.replace(weight=None if weight is None else jnp.tile(jnp.array(weight), B // 2))
-        losses[name] = float(one_update(jax.random.key(0), start, weighted, BASES["sac"])[1]["critic/loss"])
-    assert losses == pytest.approx({"none": (1.0 + 0.5) / 2, "ones": (1.0 + 0.5) / 2, "some": (1.0 + 0.25 * 0.5) / 2}, abs=1e-5)
-
-
-@pytest.mark.parametrize("base", BASES)
-def test_rows_of_weight_0_teach_the_critics_nothing(base):
-    config, first = BASES[base], np.arange(B) < B // 2
-    after = []
-    for other in (0.0, 7.0):
-        batch = make_batch(action=ACTIONS, reward=np.where(first, 1.0, other), discount=0.0).replace(weight=jnp.asarray(first, jnp.float32))
-        after.append(one_update(jax.random.key(0), fresh_agent(jax.random.key(0), config), batch, config)[0])
-    chex.assert_trees_all_close(after[0].critic_optimiser, after[1].critic_optimiser, rtol=1e-5, atol=1e-7)
-    assert max(np.abs(leaf).max() for leaf in jax.tree.leaves(after[0].critic_optimiser.mu)) > 1e-3
+    start = with_constant_critics(start, constants)
+    block = columns(reward=jnp.tile(jnp.array([0.5, 4.5]), B // 2), discount=jnp.full(B, 0.5))
+    targets = agents._targets(start, start.target_critics, config, block)
+    np.testing.assert_allclose(jnp.mean(targets, axis=0), np.tile(expected, B // 2), atol=1e-5)
 
 
 def test_a_random_subset_of_the_target_critics_is_asked():

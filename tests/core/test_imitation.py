@@ -73,8 +73,6 @@ def test_the_bonus_for_entropy_is_only_the_actors():
             reward=zero,
             discount=zero + 1.0,
             is_demonstration=zero > 0,
-            obtained_return=None,
-            weight=None,
         )
         np.testing.assert_allclose(agents._targets(state, state.target_critics, PROPOSING, block), expected, atol=1e-3)
 

@@ -91,13 +91,12 @@ def test_mean_over_blocks_is_the_mean_over_the_batch():
         reward=jnp.arange(12.0),
         discount=jnp.ones(12),
         is_demonstration=jnp.arange(12) < 5,
-        weight=jnp.asarray(rng.uniform(size=12), jnp.float32),
         nothing=None,
     )
 
     def function(block):
         # Columns stay together: a product of different fields would show a mixture.
-        product = block["inputs"][0] * block["action"][1] * block["reward"] * block["is_demonstration"] * block["weight"]
+        product = block["inputs"][0] * block["action"][1] * block["reward"] * block["is_demonstration"]
         return {"mean": jnp.mean(product), "matrix": block["inputs"] @ block["action"].T / block["reward"].shape[0]}
 
     expected = function(columns)

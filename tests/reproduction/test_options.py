@@ -13,7 +13,6 @@ from hindrl_jax.core import train as training
 from hindrl_jax.core.guidance import guidance
 from hindrl_jax.reproduction.options import BASELINE, OPTIONS, RECIPE, Group, Option, apply, half_of_the_run
 from hindrl_jax.tasks.registry import make
-from hindrl_jax.training.prioritised import sampler_for
 from hindrl_jax.training.recording import record_demonstrations
 
 
@@ -21,7 +20,7 @@ from hindrl_jax.training.recording import record_demonstrations
 def test_every_option_changes_each_of_its_fields_and_nothing_else(option):
     config = RECIPE
     before, after = (dataclasses.asdict(each) for each in (config, apply(config, option)))
-    for part in ("batch", "goal", "agent", "priority", "quirks"):
+    for part in ("batch", "goal", "agent", "quirks"):
         before |= {f"{part}.{name}": value for name, value in before.pop(part).items()}
         after |= {f"{part}.{name}": value for name, value in after.pop(part).items()}
     changed = {name for name in before if before[name] != after[name]}
@@ -44,9 +43,8 @@ def test_every_option_makes_a_program(option, demonstration):
     config = apply(RECIPE, option)
 
     def start_and_learn(key):
-        data, sampler = guidance(episodes, env, config), sampler_for(env, config)
-        state = training.init(key, data, env, config, sampler=sampler)
-        return training.learn(state, data, env=env, config=config, num_iterations=1, sampler=sampler)
+        data = guidance(episodes, env, config)
+        return training.learn(training.init(key, data, env, config), data, env=env, config=config, num_iterations=1)
 
     state, metrics = jax.eval_shape(start_and_learn, jax.random.key(0))
     assert (state.env_steps.shape, metrics["critic/loss"].shape) == ((), ())

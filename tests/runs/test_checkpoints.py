@@ -21,7 +21,6 @@ from tiny import ENV
 
 import hindrl_jax as hindrl
 from hindrl_jax import cli
-from hindrl_jax.config import PriorityConfig
 from hindrl_jax.reporting.progress import ProgressBar
 from hindrl_jax.runs.checkpoints import Checkpoints
 from hindrl_jax.runs.spec import RunSpec
@@ -29,7 +28,6 @@ from hindrl_jax.runs.writer import RunWriter
 from hindrl_jax.training import devices, experiment
 
 CONFIG = dataclasses.replace(tiny.CONFIG, steps=84)
-PRIORITISED = dataclasses.replace(CONFIG, priority=PriorityConfig(priority_exponent=0.6))
 CLONING = dataclasses.replace(CONFIG, algo="bc", steps=60)
 SEEDS = (3, 4)
 
@@ -130,7 +128,7 @@ def assert_same(result, expected):
     assert [dataclasses.replace(row, seconds=0.0) for row in result.rows] == [dataclasses.replace(row, seconds=0.0) for row in expected.rows]
 
 
-@pytest.mark.parametrize("config", [PRIORITISED, CLONING], ids=["prioritised", "bc"])  # hindrl is among the commands below
+@pytest.mark.parametrize("config", [CONFIG, CLONING], ids=["hindrl", "bc"])
 def test_a_run_killed_again_and_again_ends_as_if_it_never_was(tmp_path, demonstrations, config):
     # Reports: 1 is before anything happened, then one for each chunk of 2 steps, so there are evaluations between and right before the kills.
     for at in (4, 12):

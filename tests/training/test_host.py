@@ -14,7 +14,6 @@ from toy_env import corridor_demonstrations
 import hindrl_jax as hindrl
 from hindrl_jax import cli
 from hindrl_jax.base.errors import UserError
-from hindrl_jax.config import PriorityConfig
 from hindrl_jax.core.batch import REWARDED_BY_GOAL
 from hindrl_jax.core.hindsight import NEARBY_GOAL
 from hindrl_jax.runs.checkpoints import Checkpoints
@@ -171,11 +170,8 @@ def test_cloning_needs_no_environment_but_to_be_judged(env):
 
 def test_other_options_work_as_well(env, demonstrations):
     """All at once, since each would be compiled for long."""
-    priority = PriorityConfig(priority_exponent=0.5)
     goal = dataclasses.replace(CONFIG.goal, achieved_goal_ratio=0.5)
-    config = dataclasses.replace(
-        with_batch(CONFIG, hindrl_sampling_strategy="joint_intersection"), goal=goal, priority=priority, bc_warm_start=3, steps=120
-    )
+    config = dataclasses.replace(with_batch(CONFIG, hindrl_sampling_strategy="joint_intersection"), goal=goal, bc_warm_start=3, steps=120)
     result = hindrl.fit(env, demonstrations, config)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(jax.device_get(result.state.agent)))
     replay = jax.device_get(result.state.replay)
