@@ -74,8 +74,9 @@ def command_line() -> str:
         for words, function in [((name,), command)] if callable(command) else [((name, sub), f) for sub, f in command.items()]:
             sections += [f"## hindrl {' '.join(words)}", str(function.__doc__), f"```text\n{help_text(words)}\n```"]
             if words in (("train",), ("demos", "record")):
-                arm = help_text((*words, "--env", "FixedParameterizedReach"))
-                sections += [f"### hindrl {' '.join(words)}, for the arm", "With `--env FixedParameterizedReach`:", f"```text\n{arm}\n```"]
+                for env, what in (("FixedParameterizedReach", "the arm"), ("BringNear", "two arms and cables")):
+                    answer = help_text((*words, "--env", env))
+                    sections += [f"### hindrl {' '.join(words)}, for {what}", f"With `--env {env}`:", f"```text\n{answer}\n```"]
     return "\n\n".join(sections) + "\n"
 
 

@@ -40,7 +40,7 @@ def result(rows, seeds=(3, 4), *, final=None, config=CONFIG):
         final_success=final and np.array(final),
         final_length=final and np.full(len(final), 42.0),
         evaluation_steps=final and np.full(len(final), 900),
-        returned=final and Returned(actor=None, **{name: np.array(final) for name in ("success", "length", "env_steps", "updates", "seconds")}),
+        returned=final and Returned(actor=None, **{name: np.array(final) for name in ("noise", "success", "length", "env_steps", "updates", "seconds")}),
     )
 
 

@@ -181,8 +181,8 @@ def test_another_experiment_is_refused_by_the_array_that_differs(stopped, begun)
 
 
 def test_another_layout_is_refused(stopped, begun, monkeypatch):
-    monkeypatch.setattr("hindrl_jax.runs.checkpoints.LAYOUT", 3)
-    with pytest.raises(hindrl.UserError, match="has layout 2, and this version of hindrl_jax reads 3"):
+    monkeypatch.setattr("hindrl_jax.runs.checkpoints.LAYOUT", 4)
+    with pytest.raises(hindrl.UserError, match="has layout 3, and this version of hindrl_jax reads 4"):
         Checkpoints(stopped).restore(begun)
 
 

@@ -30,6 +30,7 @@ def test_summary_takes_the_first_evaluation_at_95_percent():
         evaluation_steps=np.array([700, 800]),
         returned=Returned(
             actor=None,
+            noise=np.array([1.0, 0.0]),
             success=np.array([0.97, 0.75]),
             length=np.array([7.0, 9.0]),
             env_steps=np.array([200, 300]),
@@ -43,5 +44,6 @@ def test_summary_takes_the_first_evaluation_at_95_percent():
     assert (never.env_steps_to_95, never.updates_to_95, never.seconds_to_95) == (None, None, None)
     assert never.best_success == 0.8  # the final evaluation counts
     assert (reached.returned_success, reached.returned_length, reached.evaluation_steps) == (0.97, 7.0, 700)
+    assert (reached.returned_noise, never.returned_noise) == (1.0, 0.0)
     assert (never.returned_env_steps, never.returned_updates, never.returned_seconds) == (300, 30, 3.0)
     assert result.latest_success() == pytest.approx(0.8)
