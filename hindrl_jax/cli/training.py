@@ -41,8 +41,8 @@ def _summary_table(summary: dict[str, Any], config: TrainConfig) -> Table:
     """A line for each seed: the policy that was kept and whether it plays mean or sampled actions, the last one, and when 95% was reached first."""
     cloning = not config.learns_from_rollouts  # and so takes no environment steps
     unit, updates, actions = ("updates", [], []) if cloning else ("env_steps", ["updates"], ["actions"])
-    moment = "of update" if cloning else "of step"
-    table = Table("seed", "kept", "length", *actions, moment, "last", "95% after", *updates, "seconds", box=box.SIMPLE_HEAD)
+    moment = "at update" if cloning else "at step"
+    table = Table("seed", "kept", "length", *actions, moment, "last", f"95% {moment}", *updates, "seconds", box=box.SIMPLE_HEAD)
     for column in table.columns:
         column.justify = "right"
     for seed in summary["seeds"]:
@@ -52,7 +52,7 @@ def _summary_table(summary: dict[str, Any], config: TrainConfig) -> Table:
         if seed["updates_to_95"] is None:
             cells.append("never")
         else:
-            cells.append(f"{seed[f'{unit}_to_95']:,} {unit.removeprefix('env_')}")
+            cells.append(f"{seed[f'{unit}_to_95']:,}")
             cells += [f"{seed['updates_to_95']:,}"] * len(updates)
             cells.append(f"{seed['seconds_to_95']:.1f}")
         table.add_row(*cells)

@@ -87,9 +87,9 @@ def test_bc_counts_updates():
     seed |= dict(returned_success=1.0, returned_length=49.0, returned_noise=0.0, returned_env_steps=0, returned_updates=1_000)
     screen = console()
     screen.print(training._summary_table({"seeds": [seed]}, dataclasses.replace(CONFIG, algo="bc")))
-    assert re.search(r"1,500 updates +2\.0", screen.file.getvalue())
+    assert re.search(r"1,500 +2\.0", screen.file.getvalue())
     screen.print(training._summary_table({"seeds": [seed | {"env_steps_to_95": 300}]}, CONFIG))
-    assert re.search(r"300 steps +1,500 +2\.0", screen.file.getvalue())
+    assert re.search(r"300 +1,500 +2\.0", screen.file.getvalue())
 
 
 def test_a_second_training_begins_anew():
