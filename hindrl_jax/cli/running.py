@@ -127,7 +127,8 @@ def run(spec: RunSpec, configs: Sequence[TrainConfig], writer: RunWriter | Sweep
                 progress.close()
                 _stop(result, stop_signals.received, writer, checkpoints)
 
-        restore: dict[str, Any] = {} if checkpoints is None else {"restore": checkpoints.restore}
+        # A run that is overwritten may have left checkpoints, which are removed when this one starts.
+        restore: dict[str, Any] = {"restore": checkpoints.restore} if resumes and checkpoints is not None else {}
         try:
             return fit(spec.env, demonstrations * len(configs), **runs, report=report, **restore)
         except Diverged as error:

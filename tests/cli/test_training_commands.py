@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 import shlex
+import shutil
 
 import jax
 import numpy as np
@@ -189,6 +190,21 @@ def test_files_that_are_not_ours_are_not_replaced(tmp_path, capsys):
     (tmp_path / "summary.json").write_text("mine")
     assert "summary.json" in refusal(capsys, "train", "--out", tmp_path, *TINY)
     assert (tmp_path / "summary.json").read_text() == "mine"
+
+
+def test_a_run_that_is_overwritten_does_not_go_on_from_its_checkpoints(run, tmp_path, monkeypatch):
+    killed = tmp_path / "killed"
+    shutil.copytree(run, killed)
+    left = killed / "checkpoint" / "240"
+    left.mkdir(parents=True)
+
+    def read(self, begun):
+        raise AssertionError("a checkpoint of another run is read")
+
+    monkeypatch.setattr("hindrl_jax.runs.checkpoints.Checkpoints.restore", read)
+    cli.main(["train", "--overwrite", "--out", str(killed), *TINY])
+    assert not left.exists()
+    assert (killed / "metrics.csv").read_text().splitlines()[1].startswith("0,240,")
 
 
 def test_existing_run_is_refused_and_kept(run, capsys):

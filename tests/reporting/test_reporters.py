@@ -19,6 +19,7 @@ from hindrl_jax.training.selection import Returned
 
 ENV = hindrl.make("FixedGridPickAndPlace")
 CONFIG = TrainConfig()
+RETURNED = ("noise", "success", "length", "env_steps", "updates", "seconds")
 
 
 def row(seed, steps, success, *, algo="hindrl"):
@@ -40,7 +41,7 @@ def result(rows, seeds=(3, 4), *, final=None, config=CONFIG):
         final_success=final and np.array(final),
         final_length=final and np.full(len(final), 42.0),
         evaluation_steps=final and np.full(len(final), 900),
-        returned=final and Returned(actor=None, **{name: np.array(final) for name in ("noise", "success", "length", "env_steps", "updates", "seconds")}),
+        returned=final and Returned(actor=None, **{name: np.array(final) for name in RETURNED}),
     )
 
 
