@@ -19,6 +19,8 @@ CAPTION_HEIGHT = 62
 """Pixels."""
 LINGER = 1.0
 """Seconds that the last picture of an episode stays longer."""
+MAX_PICTURES = 160
+"""Of one animation at 20 states per second; of longer episodes every second state is shown, or every third, ..."""
 BACKGROUND = (255, 255, 255)
 INK = (38, 44, 54)
 FAINT_INK = (110, 118, 130)
@@ -91,6 +93,16 @@ def captioned_states(states: Any, captions: Sequence[str] | None, state_type: ty
     if len(captions) != len(states):
         raise ValueError(f"Pass one caption per state: got {len(captions)} captions for {len(states)} states.")
     return list(zip(states, captions, strict=True))
+
+
+def shown_states(num_states: int, seconds_per_state: float) -> tuple[list[int], list[float]]:
+    """Which of an episode's states an animation shows, at most `MAX_PICTURES` or so and the last one always, and for how many seconds each.
+
+    The animation takes as long as it would with all of them.
+    """
+    stride = -(-num_states // MAX_PICTURES)
+    shown = [*range(0, num_states - 1, stride), num_states - 1]
+    return shown, [*(seconds_per_state * np.diff(shown)), seconds_per_state]
 
 
 def save_png(picture: np.ndarray, path: str | PathLike) -> None:

@@ -25,7 +25,7 @@ from hindrl_jax.base.types import Array
 from hindrl_jax.envs import panda, rotations
 from hindrl_jax.envs.cable import CableState, CableTask, Scene, geometry
 from hindrl_jax.envs.cable.rules import GRASP, MEETING, MEETING_HEADS, tip_error
-from hindrl_jax.envs.panda.linear_algebra import product, times
+from hindrl_jax.envs.panda.linear_algebra import length, product, times
 
 _BEFORE, _BEFORE_BOX = 0.09, np.array([0.03, 0.03, 0.05])  # m, from the grip, and half of the box of places there
 _MEETING_BOX = np.array([0.02, 0.03, 0.04])  # m, half
@@ -140,9 +140,9 @@ def _towards_grip(hand: _Pose, grip: Array, before: Array, is_closing: Array) ->
     """
     grasp = jnp.asarray(GRASP, jnp.float32)
     exact, first = _displacement(hand, (grip, grasp)), _displacement(hand, (grip + before, grasp))
-    distance, angle = _length(exact[:3]), _length(exact[3:])
+    distance, angle = length(exact[:3]), length(exact[3:])
     along = jnp.clip(jnp.sum(-exact[:3] * before) / jnp.sum(jnp.square(before)), 0.0, 1.0)  # 0 at the grip, 1 at the first place
-    is_near_way = (_length(exact[:3] + along * before) < _CORRIDOR) & (angle < _CORRIDOR_ANGLE)
+    is_near_way = (length(exact[:3] + along * before) < _CORRIDOR) & (angle < _CORRIDOR_ANGLE)
     arrives = (distance < _AT_GRIP) & (angle < _AT_GRIP_ANGLE)
     closes = arrives | (is_closing & (distance < _STILL_AT_GRIP) & (angle < _CORRIDOR_ANGLE))
     return (jnp.where(is_near_way, exact, first), ~is_near_way), closes
@@ -159,7 +159,7 @@ def _meeting(scene: Scene, plan: _Plan, *, inserts: bool) -> tuple[_Pose, Array]
         plug, socket = scene.head_rotations[:, :, 2]
         offset = tip_error(scene, 0.0)
         height = jnp.sum(offset * socket)
-        aside, angle = _length(offset - height * socket), rotations.angle(plug, -socket)
+        aside, angle = length(offset - height * socket), rotations.angle(plug, -socket)
         aligned = product(rotations.from_rotation_vector(rotations.turning(plug, -socket)), scene.head_rotations[0])
         socket_at = _hand_of(scene, 1, tips[1], heads[1])
         is_ready = _is_within(_displacement((scene.hand_positions[1], scene.hand_rotations[1]), socket_at), 0.012, 0.1)
@@ -185,8 +185,4 @@ def _hand_of(scene: Scene, head: int, tip: Array, rotation: Array) -> _Pose:
 
 
 def _is_within(displacement: Array, distance: float, angle: float) -> Array:
-    return (_length(displacement[:3]) < distance) & (_length(displacement[3:]) < angle)
-
-
-def _length(vector: Array) -> Array:
-    return jnp.sqrt(jnp.sum(jnp.square(vector)) + 1e-20)
+    return (length(displacement[:3]) < distance) & (length(displacement[3:]) < angle)

@@ -30,12 +30,17 @@ class Joints(struct.PyTreeNode, kw_only=True):
 
 
 def start(joints: Array, num_links: int) -> Joints:
-    """At rest, with arms at joints (2, 7) in rad, and hanging cables."""
+    """At rest, with arms at joints (2, 7) in rad, and hanging cables of that many links."""
     fingers = jnp.broadcast_to(geometry.INITIAL_FINGER * jnp.array([1.0, -1.0]), (2, 2))
     arms = jnp.concatenate([joints, fingers], axis=1).reshape(-1)
     positions = jnp.concatenate([arms, jnp.zeros(2 * (2 * num_links + 3))])
     nothing = jnp.zeros_like(positions)
     return Joints(positions=positions, velocities=nothing, accelerations=nothing)
+
+
+def num_links(physics: Joints) -> int:
+    """Of each cable."""
+    return (physics.positions.shape[-1] - 24) // 4
 
 
 def arms(physics: Joints) -> tuple[Array, Array]:
@@ -124,9 +129,7 @@ def _bent(rotation: Array, bend: Array) -> Array:
 
 def _is_held(position: Array, axis: Array, fingers: Array) -> Array:
     """() bool, for a head with grip site (3,) and z axis (3,) in the hand's axes, and the fingers' coordinates (2,)."""
-    offset = position - jnp.array([0.0, 0.0, geometry.PAD_HEIGHT])
-    along = jnp.clip(jnp.sum(offset * axis), -geometry.GRIP_HALF_LENGTH, geometry.GRIP_HALF_LENGTH)
-    x, y, z = offset - along * axis
+    x, y, z = geometry.from_pads_to_grip(position, axis)
     beside = jnp.maximum(jnp.abs(x), jnp.abs(z)) < geometry.PAD_HALF_SIZE + _BESIDE_PAD
     gaps = jnp.array([1.0, -1.0]) * (fingers - y) - _PAD_SURFACE - geometry.GRIP_RADIUS  # of the left pad and of the right one
     return beside & jnp.all(gaps < _TOUCHING)

@@ -24,7 +24,7 @@ from hindrl_jax.envs.cable import contact, geometry
 from hindrl_jax.envs.cable.contact import Socket
 from hindrl_jax.envs.cable.types import Scene
 from hindrl_jax.envs.panda import position_actuators
-from hindrl_jax.envs.panda.linear_algebra import inverse, product, times
+from hindrl_jax.envs.panda.linear_algebra import inverse, length, product, times
 
 _GRAVITY = 9.81  # m/s^2
 _CARRIED = 0.2  # share of a cable that the hand carries where heads meet: idle arms then sink as in MuJoCo
@@ -155,8 +155,8 @@ def _carried(physics: ClosedForm) -> tuple[Array, Array]:
 def _beyond_leash(positions: Array, head_rotations: Array) -> tuple[Array, Array]:
     """By how much the cables are too short for the heads, m (2,), and the directions (2, 3) in which they run from the bar."""
     run = positions - geometry.GRIP * head_rotations[:, :, 2] - jnp.asarray(geometry.ANCHORS)
-    length = jnp.sqrt(jnp.sum(jnp.square(run), axis=1) + 1e-20)
-    return length - geometry.CABLE_LENGTH, run / length[:, None]
+    distance = length(run)
+    return distance - geometry.CABLE_LENGTH, run / distance[:, None]
 
 
 def _pushed(before: ClosedForm, moved: ClosedForm) -> ClosedForm:
@@ -228,8 +228,8 @@ def _swing(position: Array, speed: Array, anchor: Array) -> tuple[Array, Array]:
         position, speed = carry
         speed = speed + step * (jnp.array([0.0, 0.0, -_GRAVITY]) - _SWING_DAMPING * speed)
         run = position + step * speed - anchor
-        length = jnp.sqrt(jnp.sum(jnp.square(run)) + 1e-20)
-        direction, is_taut = run / length, length > longest
+        distance = length(run)
+        direction, is_taut = run / distance, distance > longest
         outwards = jnp.maximum(jnp.sum(speed * direction), 0.0)
         return (anchor + jnp.where(is_taut, longest * direction, run), jnp.where(is_taut, speed - outwards * direction, speed)), None
 
@@ -238,7 +238,7 @@ def _swing(position: Array, speed: Array, anchor: Array) -> tuple[Array, Array]:
 
 def _hanging(rotation: Array, run: Array) -> Array:
     """(3, 3) a free head, turned towards the direction in which its cable (3,) runs."""
-    turn = rotations.turning(rotation[:, 2], run / jnp.sqrt(jnp.sum(jnp.square(run)) + 1e-20))
+    turn = rotations.turning(rotation[:, 2], run / length(run))
     return product(rotations.from_rotation_vector(_UPRIGHT_SHARE * turn), rotation)
 
 
@@ -249,11 +249,9 @@ def _grasp(position: Array, rotation: Array) -> tuple[Array, Array, Array]:
       () bool, whether its grip is between them, and the head's position (3,) and rotation (3, 3) once they have centred it.
     """
     axis = rotation[:, 2]
-    offset = position - jnp.array([0.0, 0.0, geometry.PAD_HEIGHT])
-    along = jnp.clip(jnp.sum(offset * axis), -geometry.GRIP_HALF_LENGTH, geometry.GRIP_HALF_LENGTH)
-    x, y, z = offset - along * axis  # from the pads to the nearest point of the grip's axis
+    x, y, z = geometry.from_pads_to_grip(position, axis)
     within_pads = jnp.sqrt(jnp.square(x) + jnp.square(z)) < geometry.PAD_HALF_SIZE
     between = within_pads & (jnp.abs(y) < geometry.MAX_FINGER - geometry.GRIP_RADIUS - 0.002) & (jnp.abs(axis[1]) < 0.35)
     flat = axis * jnp.array([1.0, 0.0, 1.0])
-    turn = rotations.turning(axis, flat / jnp.sqrt(jnp.sum(jnp.square(flat)) + 1e-20))
+    turn = rotations.turning(axis, flat / length(flat))
     return between, position * jnp.array([1.0, 0.0, 1.0]), product(rotations.from_rotation_vector(turn), rotation)

@@ -18,7 +18,7 @@ from flax import struct
 from hindrl_jax.base.types import Array
 from hindrl_jax.envs import rotations
 from hindrl_jax.envs.cable import geometry
-from hindrl_jax.envs.panda.linear_algebra import times
+from hindrl_jax.envs.panda.linear_algebra import length, times
 
 _HAND_PARTS = np.array(  # ends (m, in the hand) and radius of the capsules that a hand is: across its palm, and along its fingers
     [[[0.0, -0.07, -0.067], [0.0, 0.07, -0.067]], [[0.0, 0.0, -0.067], [0.0, 0.0, -0.01]]], np.float32
@@ -49,7 +49,7 @@ def hands_apart(positions: Array, hand_rotations: Array) -> Array:
     first, second = (jnp.stack([ends[hand][part] for part in order]) for hand, order in ((0, (0, 0, 1, 1)), (1, (0, 1, 0, 1))))
     radii = (_HAND_RADII[:, None] + _HAND_RADII[None, :]).reshape(-1)
     apart = jax.vmap(between_segments)(first, second)  # (4, 3)
-    distances = _length(apart)
+    distances = length(apart)
     gaps = distances - radii
     nearest = jnp.arange(4) == jnp.argmin(gaps)
     direction = jnp.sum(jnp.where(nearest[:, None], apart / distances[:, None], 0.0), axis=0)
@@ -80,11 +80,11 @@ def plug_in_socket(before: tuple[Array, Array], after: tuple[Array, Array], sock
     height_before, aside_before = _seen_from_socket(*before)
     height, aside = _seen_from_socket(*after)
     plug, axis = after[1][:, :, 2]
-    off, angle = _length(aside), rotations.angle(plug, -axis)
+    off, angle = length(aside), rotations.angle(plug, -axis)
     outwards = aside / off
 
     was_inside = height_before < -_AT_MOUTH
-    is_in = was_inside & (_length(aside_before) < geometry.CLEARANCE + geometry.CHAMFER)
+    is_in = was_inside & (length(aside_before) < geometry.CLEARANCE + geometry.CHAMFER)
     mouth = jnp.where(off < socket.capture_radius, 0.0, geometry.CHAMFER)  # one that is too far aside rests on the chamfer's rim
     at_bore = (height < mouth) & (height > -geometry.TIPS[1])
     entering = at_bore & ~was_inside & (off < socket.capture_radius) & (angle < socket.capture_angle)
@@ -120,8 +120,3 @@ def _seen_from_socket(positions: Array, head_rotations: Array) -> tuple[Array, A
 def tip(position: Array, rotation: Array, head: int) -> Array:
     """(3,) m, of the plug (0) or socket (1) at (3,) and (3, 3)."""
     return position + geometry.to_tip(head) * times(rotation, jnp.array([0.0, 0.0, 1.0]))
-
-
-def _length(vectors: Array) -> Array:
-    """(...) of vectors (..., 3), never quite 0, so that one can divide by it."""
-    return jnp.sqrt(jnp.sum(jnp.square(vectors), axis=-1) + 1e-20)

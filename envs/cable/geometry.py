@@ -6,7 +6,10 @@ end to the head's tip, and a head is where its grip site is. The world's origin 
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import numpy as np
+
+from hindrl_jax.base.types import Array
 
 BASES = np.array([[-0.91, 0.25, 0.912], [-0.91, -0.25, 0.912]], np.float32)
 """(2, 3) of the arms."""
@@ -51,6 +54,13 @@ MAX_FINGER = 0.04
 """Coordinate of an open finger; the opening is twice that."""
 INITIAL_FINGER = 0.0208
 """robosuite's at reset."""
+
+
+def from_pads_to_grip(position: Array, axis: Array) -> Array:
+    """(3,) from the middle of the pads to the nearest point of a grip's axis, for a head with grip site and z axis (3,) in the hand's axes."""
+    offset = position - jnp.array([0.0, 0.0, PAD_HEIGHT])
+    along = jnp.clip(jnp.sum(offset * axis), -GRIP_HALF_LENGTH, GRIP_HALF_LENGTH)
+    return offset - along * axis
 
 
 def to_tip(head: int) -> float:

@@ -25,7 +25,7 @@ def _model(num_links: int) -> Any:
 
 def control_step(physics: Joints, rest: Array, finger_targets: Array, command: Array) -> Joints:
     """One control step: 10 substeps of MJX. Arguments are those of `closed_form.control_step`."""
-    mjx, on_device = import_mjx(), _model((physics.positions.shape[0] - 24) // 4)
+    mjx, on_device = import_mjx(), _model(chains.num_links(physics))
     data = mjx.make_data(on_device).replace(qpos=physics.positions, qvel=physics.velocities, qacc_warmstart=physics.accelerations)
     data = data.replace(ctrl=chains.controls(physics, rest, finger_targets, command))
     data = jax.lax.fori_loop(0, position_actuators.SUBSTEPS, lambda _, data: mjx.step(on_device, data), data)

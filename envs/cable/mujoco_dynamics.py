@@ -50,7 +50,7 @@ def _roll(physics: Any, controls: Any) -> Any:
     after = np.full((3, len(batch), size), np.nan, np.float32)
     if usable.any():
         with _LOCK:
-            model, pool, data = _pool((size - 24) // 4)
+            model, pool, data = _pool(chains.num_links(physics))
             options = {"nstep": position_actuators.SUBSTEPS, "initial_warmstart": accelerations[usable]}
             states, _ = pool.rollout(model, data, batch[usable], controls[usable][:, None], **options)
         speeds = states[:, -2:, 1 + size :]

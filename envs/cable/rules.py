@@ -157,9 +157,7 @@ class CableTask(abc.ABC):
     def reset(self, key: Array) -> tuple[CableState, Array]:
         """Starts an episode: key -> (state, observation (D,))."""
         key_episode, key_joints, key_physics = jax.random.split(key, 3)
-        initial = jnp.broadcast_to(jnp.asarray(panda.INITIAL_JOINTS, jnp.float32), (2, panda.NUM_JOINTS))
-        lower, upper = (jnp.broadcast_to(jnp.asarray(limit, jnp.float32), initial.shape) for limit in (panda.chain().lower, panda.chain().upper))
-        joints = jnp.clip(initial + self.joint_noise * jax.random.normal(key_joints, initial.shape), lower, upper)
+        joints = panda.joints_at_reset(key_joints, self.joint_noise, 2)
         if self.backend == "closed_form":
             physics: Any = closed_form.start(key_physics, joints, randomised=self.randomised)
         else:

@@ -19,7 +19,6 @@ from hindrl_jax.envs.panda import meshes
 from hindrl_jax.envs.panda.renderer import Renderer, View
 
 _VIEW = View(width=480, height=400, look_at=(-0.52, 0.0, 1.31), distance=1.58, azimuth=152.0, elevation=-14.0)  # the caption comes below
-_MAX_PICTURES = 160  # of one animation; of longer episodes every second state is shown, or every third, ...
 _CABLE = (0.22, 0.24, 0.28, 1.0)
 _PATHS = ((0.85, 0.26, 0.20, 0.6), (0.18, 0.43, 0.84, 0.6))  # of the tips of plug and socket, in the colours of both
 _POINTS = 24  # along a cable
@@ -76,11 +75,9 @@ def animation(
       UserError: if no OpenGL library can draw without a screen.
     """
     pairs = drawing.captioned_states(states, captions, CableState)
-    stride = -(-len(pairs) // _MAX_PICTURES)
-    shown = [*range(0, len(pairs) - 1, stride), len(pairs) - 1]
+    shown, seconds = drawing.shown_states(len(pairs), seconds_per_frame)
     way = [_tips(state) for state, _ in pairs]
-    pictures = [_draw(env, pairs[i][0], pairs[i][1], way[: i + 1]) for i in shown]
-    return pictures, [*(seconds_per_frame * np.diff(shown)), seconds_per_frame]
+    return [_draw(env, pairs[i][0], pairs[i][1], way[: i + 1]) for i in shown], seconds
 
 
 def in_words(env: CableTask, state: CableState) -> str:

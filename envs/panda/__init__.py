@@ -15,7 +15,7 @@ from hindrl_jax.envs.panda.controller import (
     joint_targets,
     shortened_command,
 )
-from hindrl_jax.envs.panda.kinematics import Posture, jacobian, posture
+from hindrl_jax.envs.panda.kinematics import Posture, jacobian, joints_at_reset, posture
 from hindrl_jax.envs.panda.robot import INITIAL_JOINTS, MODEL_PATH, NUM_JOINTS, Chain, chain, import_mujoco, longest_reach, model
 
 __all__ = [
@@ -34,6 +34,7 @@ __all__ = [
     "import_mujoco",
     "jacobian",
     "joint_targets",
+    "joints_at_reset",
     "longest_reach",
     "mass_matrix",
     "model",

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from hindrl_jax.base.types import Array
 from hindrl_jax.envs.panda.linear_algebra import product
-from hindrl_jax.envs.panda.robot import chain
+from hindrl_jax.envs.panda.robot import INITIAL_JOINTS, NUM_JOINTS, chain
 
 
 class Posture(NamedTuple):
@@ -50,6 +50,13 @@ def posture(joints: Array) -> Posture:
         hand_position=origin + product(rotation, c.hand_offset[:, None])[:, 0],
         hand_rotation=product(rotation, c.hand_rotation),
     )
+
+
+def joints_at_reset(key: Array, deviation: float, *leading: int) -> Array:
+    """(*leading, 7) rad, robosuite's initial joints with Gaussian noise of that deviation, within the joints' limits."""
+    c, shape = chain(), (*leading, NUM_JOINTS)
+    initial, lower, upper = (jnp.broadcast_to(jnp.asarray(joints, jnp.float32), shape) for joints in (INITIAL_JOINTS, c.lower, c.upper))
+    return jnp.clip(initial + deviation * jax.random.normal(key, shape), lower, upper)
 
 
 def jacobian(posture: Posture) -> Array:

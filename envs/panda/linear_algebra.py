@@ -1,4 +1,4 @@
-"""Products and inverses of small matrices, written so that thousands of them side by side are fast on a CPU. All unbatched."""
+"""Products and inverses of small matrices, and lengths, written so that thousands of them side by side are fast on a CPU. Matrices are unbatched."""
 
 from __future__ import annotations
 
@@ -19,6 +19,11 @@ def product(a: Array, b: Array | np.ndarray) -> Array:
 def times(a: Array, x: Array) -> Array:
     """a x of a small matrix (m, k) and a vector (k,)."""
     return functools.reduce(jnp.add, [a[:, i] * x[i] for i in range(a.shape[1])])
+
+
+def length(vectors: Array) -> Array:
+    """(...) of vectors (..., n), never quite 0, so that one can divide by it."""
+    return jnp.sqrt(jnp.sum(jnp.square(vectors), axis=-1) + 1e-20)
 
 
 def inverse(matrix: Array) -> Array:

@@ -138,9 +138,7 @@ class ReachTask(abc.ABC):
     def reset(self, key: Array) -> tuple[ReachState, Array]:
         """Starts an episode: key -> (state, observation (D,))."""
         key_episode, key_joints, key_waypoints = jax.random.split(key, 3)
-        noise = self.joint_noise * jax.random.normal(key_joints, (panda.NUM_JOINTS,))
-        lower, upper = (jnp.asarray(limit, jnp.float32) for limit in (panda.chain().lower, panda.chain().upper))
-        joints = jnp.clip(jnp.asarray(panda.INITIAL_JOINTS, jnp.float32) + noise, lower, upper)
+        joints = panda.joints_at_reset(key_joints, self.joint_noise)
         positions, rotation_matrices = self._waypoints(key_waypoints)
         state = ReachState(
             key=key_episode,

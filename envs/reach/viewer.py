@@ -17,7 +17,6 @@ from hindrl_jax.envs.reach.rules import ReachTask
 from hindrl_jax.envs.reach.types import ReachState
 
 _VIEW = View(width=480, height=400, look_at=(0.32, 0.03, 0.25), distance=1.46, azimuth=145.0, elevation=-22.0)  # the caption comes below
-_MAX_PICTURES = 160  # of one animation; of longer episodes every second state is shown, or every third, ...
 
 _GREEN = tuple(v / 255 for v in drawing.GREEN)
 _BLUE = tuple(v / 255 for v in drawing.BLUE)
@@ -78,11 +77,9 @@ def animation(
       UserError: if no OpenGL library can draw without a screen.
     """
     pairs = drawing.captioned_states(states, captions, ReachState)
-    stride = -(-len(pairs) // _MAX_PICTURES)
-    shown = [*range(0, len(pairs) - 1, stride), len(pairs) - 1]
+    shown, seconds = drawing.shown_states(len(pairs), seconds_per_frame)
     way = [_renderer().hand_position(state.joints) for state, _ in pairs]
-    pictures = [_draw(env, pairs[i][0], pairs[i][1], way[: i + 1]) for i in shown]
-    return pictures, [*(seconds_per_frame * np.diff(shown)), seconds_per_frame]
+    return [_draw(env, pairs[i][0], pairs[i][1], way[: i + 1]) for i in shown], seconds
 
 
 def _draw(env: ReachTask, state: ReachState, caption: str, way: Sequence[np.ndarray]) -> np.ndarray:

@@ -208,7 +208,7 @@ def test_gif_holds_every_state_in_order_at_its_time(tmp_path, stacked):
     ],
 )
 def test_long_episodes_are_thinned_out_in_real_time(tmp_path, monkeypatch, length, shown, durations):
-    monkeypatch.setattr(viewer, "_MAX_PICTURES", 4)
+    monkeypatch.setattr(drawing, "MAX_PICTURES", 4)
     drawn = []
 
     def draw(env, state, caption, way):
