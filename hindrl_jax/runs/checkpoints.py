@@ -167,7 +167,7 @@ class Checkpoints:
         """Removes older checkpoints and what was not finished."""
         for path in self.folder.iterdir() if self.folder.is_dir() else ():
             if path.is_dir() and path != but:
-                shutil.rmtree(path)
+                _remove_folder(path)
 
     def _complete(self) -> list[Path]:
         """The folders of complete checkpoints, the newest last."""
@@ -192,6 +192,15 @@ class Checkpoints:
                 yield
         except (OSError, ValueError, KeyError, TypeError) as error:  # what libraries say of bytes that make no sense
             raise UserError(f"{path} is damaged ({one_line(error)[:200]}): remove it to begin again") from error
+
+
+def _remove_folder(path: Path, *, patience: float = 5.0) -> None:
+    """Removes a folder into which threads of a failed save may still be writing; what is left after `patience` seconds, the next save removes."""
+    until = time.monotonic() + patience
+    shutil.rmtree(path, ignore_errors=True)
+    while path.exists() and time.monotonic() < until:
+        time.sleep(0.05)
+        shutil.rmtree(path, ignore_errors=True)
 
 
 def _orbax() -> Any:

@@ -1,5 +1,6 @@
 """Going on after a stop: bit for bit, from complete checkpoints only, and never at the cost of the last good one."""
 
+import contextlib
 import dataclasses
 import gc
 import json
@@ -9,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from types import SimpleNamespace
 
@@ -201,6 +203,28 @@ def test_a_full_disk_leaves_the_checkpoint_before(stopped, begun):
     assert Checkpoints(stopped).restore(begun).env_steps == steps
     checkpoints.save(result)
     assert Checkpoints(stopped).restore(begun).env_steps == steps + 2
+
+
+def test_a_folder_is_removed_although_a_thread_still_writes_into_it(stopped, begun):
+    """As those of the library do for a moment after they failed."""
+    late = stopped / "unfinished"
+    late.mkdir()
+
+    checkpoints = Checkpoints(stopped)
+    result = checkpoints.restore(begun)
+    result.env_steps += 2
+    until = time.monotonic() + 3
+
+    def write():
+        while time.monotonic() < until:
+            with contextlib.suppress(FileNotFoundError):
+                (late / str(time.monotonic_ns())).write_bytes(b"late")
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    checkpoints.save(result)
+    writer.join()
+    assert [path.name for path in stopped.iterdir()] == [str(result.env_steps)]
 
 
 def test_nothing_is_saved_of_what_is_not_worth_it(stopped, begun):
