@@ -13,7 +13,10 @@ from hindrl_jax.training.result import Result
 
 
 def save_curve(result: Result, path: Path) -> None:
-    """Draws success and episode length over training, one thin line per seed, their mean and its 95% bootstrap interval, as a PNG."""
+    """Draws success and episode length over training, one thin line per seed, their mean and its 95% bootstrap interval, as a PNG.
+
+    Of mean actions; the success of sampled ones is a dotted line, the mean over seeds.
+    """
     x, success, length = _curves(result)
     with figure(path, rows=2, figsize=(7, 5.5), sharex=True, height_ratios=(3, 2)) as (_, axes):
         for axis, values in zip(axes, (success, length), strict=True):
@@ -21,6 +24,10 @@ def save_curve(result: Result, path: Path) -> None:
                 axis.plot(x, values, color=SEED, linewidth=0.6)
                 band(axis, x, values, MEAN)
             mean_line(axis, x, values, colour=MEAN, label=_mean_label(result))
+        sampled = [row.sampled_success for row in result.rows if row.sampled_success is not None]
+        if len(sampled) == len(result.rows):
+            by_seed = 100 * np.reshape(sampled, success.shape)
+            axes[0].plot(x, by_seed.mean(axis=1), color=MEAN, linewidth=1, linestyle=":", label="with sampled actions")
         _mark_events(axes[0], result)
         lengths = np.asarray(result.guidance.demonstrations.lengths) * result.config.num_held
         axes[1].axhline(lengths.mean(), color=DEMONSTRATION, linestyle="--", linewidth=1, label="demonstrations")

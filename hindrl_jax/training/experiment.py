@@ -22,7 +22,7 @@ from hindrl_jax.training.checks import check_config, check_seeds, check_trainabl
 from hindrl_jax.training.devices import gather, spread
 from hindrl_jax.training.host import HostPrograms
 from hindrl_jax.training.programs import FRESH_EPISODES, JaxPrograms, Programs
-from hindrl_jax.training.result import Result, Row
+from hindrl_jax.training.result import SAMPLED_SUCCESS, Result, Row
 from hindrl_jax.training.selection import Trial, better, choose, keep, nothing_kept
 
 Report = Callable[[Result], Any]
@@ -156,7 +156,7 @@ def _evaluate(result: Result, programs: Programs, started: float) -> None:
     averaged = {name: np.mean([chunk[name] for chunk in result.chunks], axis=0) for name in result.chunks[0]} if result.chunks else {}
     if result.config.learns_from_rollouts:  # cloning leaves the deviation of the actions as it happens to be
         sampled = _played(result, programs, _with_noise(present, np.ones_like(noise), programs), num_episodes)
-        averaged["evaluation/sampled_success"] = np.asarray(sampled.success).mean(axis=1)
+        averaged[SAMPLED_SUCCESS] = np.asarray(sampled.success).mean(axis=1)
         noise, evaluation = better(by_mean, sampled)
     result.train_seconds = time.perf_counter() - started
     result.rows += _rows(result, by_mean, averaged)

@@ -14,6 +14,9 @@ from hindrl_jax.core.guidance import Guidance
 from hindrl_jax.core.train import TrainState
 from hindrl_jax.training.selection import Kept, Moment, Returned
 
+SAMPLED_SUCCESS = "evaluation/sampled_success"
+"""The metric that `Row.sampled_success` reads."""
+
 SOLVED = 0.95
 """Share of an evaluation's episodes from which on a task counts as learned."""
 
@@ -28,11 +31,16 @@ class Row:
     seconds: float
     """Wall-clock training time of the whole run up to here, evaluations included, compilation not."""
     success: float
-    """Share of the evaluation's episodes that solved the task."""
+    """Share of the evaluation's episodes that the policy solved with its mean actions."""
     episode_length: float
     """Mean number of steps of those episodes."""
     metrics: dict[str, float]
     """Losses and values, averaged over the gradient steps since the last evaluation."""
+
+    @property
+    def sampled_success(self) -> float | None:
+        """The share that the same policy solves with actions that it samples; None where only the mean action was played."""
+        return self.metrics.get(SAMPLED_SUCCESS)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,7 +12,7 @@ from rich.console import Console
 import hindrl_jax as hindrl
 from hindrl_jax.cli import training
 from hindrl_jax.config import TrainConfig
-from hindrl_jax.reporting.progress import bar
+from hindrl_jax.reporting.progress import bar, evaluation_line
 from hindrl_jax.training.result import Row
 
 CONFIG = TrainConfig(steps=4_000)
@@ -57,6 +57,11 @@ def test_a_log_file_gets_ten_plain_lines():
     lines = written.splitlines()
     assert [line.split()[0] for line in lines] == [f"{steps:,}" for steps in range(400, 4_001, 400)]
     assert lines[4] == "    2,000 steps    2,000 updates    20.0 s   success  38% (worst  25%)   length  50.0"
+
+
+def test_what_sampled_actions_solve_stands_beside():
+    rows = [dataclasses.replace(row, metrics={"evaluation/sampled_success": share}) for row, share in zip(result(100).rows, (1.0, 0.5), strict=True)]
+    assert evaluation_line(rows) == "      100 steps      100 updates     1.0 s   success   2% (worst   1%)   sampled  75%   length  50.0"
 
 
 def test_a_terminal_shows_the_lines_above_a_bar_that_goes_in_the_end():
