@@ -67,14 +67,14 @@ def compare(arguments: list[str]) -> None:
 
 
 def _table(compared: list[Comparison]) -> Table:
-    table = Table("run", "final success", "95% reached", "median steps", "seconds", "difference", box=box.SIMPLE_HEAD)
+    table = Table("run", "returned policies", "95% reached", "median steps", "seconds", "difference", box=box.SIMPLE_HEAD)
     for column in table.columns[1:]:
         column.justify = "right"
     for one in compared:
         run = one.run
         table.add_row(
             run.label + ("" if run.finished else " *"),
-            _interval(one.final_success, "{:.1f}%"),
+            _interval(one.returned_success, "{:.1f}%"),
             f"{one.seeds_reaching_95} of {len(run.spec.seeds)}",
             f"{one.steps_to_95:,.0f}{' updates' if run.cloning else ''}" if np.isfinite(one.steps_to_95) else "never",
             f"{one.seconds_to_95:,.1f}" if np.isfinite(one.seconds_to_95) else "never",

@@ -124,5 +124,5 @@ def _outcome_line(outcome: Outcome) -> str:
     median = f"median {steps:9,.0f} steps" if np.isfinite(steps) else f"median {'never':>9}      "
     return (
         f"{outcome.cell.task:<10}{outcome.cell.name:<22}{outcome.seeds_reaching_95:3d} of {len(spec.seeds)} reach 95%, {median}   "
-        f"final {outcome.final_success.estimate:4.0%}   {outcome.seconds_per_seed * len(spec.seeds):6.1f} s"
+        f"returned {outcome.returned_success.estimate:4.0%}   {outcome.seconds_per_seed * len(spec.seeds):6.1f} s"
     )

@@ -70,14 +70,14 @@ def _grid(over: Sequence[str], config: TrainConfig) -> Iterator[dict[str, float]
 
 def _sweep_table(rows: Sequence[dict[str, Any]], swept: Sequence[str]) -> Table:
     unit = next(name for name in rows[0] if name.startswith("median_")).split("_")[1]
-    table = Table(*swept, "95% reached", f"median {unit}", "mean final", "worst", box=box.SIMPLE_HEAD)
+    table = Table(*swept, "95% reached", f"median {unit}", "mean returned", "worst", box=box.SIMPLE_HEAD)
     for row in rows:
         median = row[f"median_{unit}_to_95"]
         table.add_row(
             *(f"{row[name]:g}" for name in swept),
             f"{row['seeds_reaching_95']} of {row['seeds']}",
             "never" if median is None else f"{median:,.0f}",
-            f"{row['mean_final_success']:.0%}",
-            f"{row['worst_final_success']:.0%}",
+            f"{row['mean_returned_success']:.0%}",
+            f"{row['worst_returned_success']:.0%}",
         )
     return table

@@ -27,14 +27,14 @@ class Comparison:
     """One run beside the first. Intervals of a single seed are infinitely wide."""
 
     run: RecordedRun
-    final_success: Interval
+    returned_success: Interval
     seeds_reaching_95: int
     steps_to_95: float
     """Median over all seeds, infinite if half of them never get there. Environment steps; for bc, gradient steps."""
     seconds_to_95: float
     """Likewise."""
     difference: Interval | None
-    """Of the final success from that of the first run; None for the first."""
+    """Of the returned policies' success from that of the first run's; None for the first."""
     paired: bool
     """Whether the difference is taken seed by seed: both runs have the same ones."""
 
@@ -126,7 +126,7 @@ def _csv_row(one: Comparison) -> dict[str, Any]:
         "median_updates_to_95": f"{one.steps_to_95:.6g}" if run.cloning else "",
         "median_seconds_to_95": f"{one.seconds_to_95:.6g}",
     }
-    for name, interval in (("final_success", one.final_success), ("difference", one.difference)):
+    for name, interval in (("returned_success", one.returned_success), ("difference", one.difference)):
         for suffix, field in (("", "estimate"), ("_low", "low"), ("_high", "high")):
             row[name + suffix] = "" if interval is None else f"{getattr(interval, field):.6g}"
     return row | {"paired": "" if one.difference is None else one.paired}
@@ -137,16 +137,16 @@ def _compared(run: RecordedRun, first: RecordedRun) -> Comparison:
     if run is not first:
         order = {seed: index for index, seed in enumerate(first.spec.seeds)}
         paired = set(order) == set(run.spec.seeds)
-        baseline = first.final_success[[order[seed] for seed in run.spec.seeds]] if paired else first.final_success
-        if min(len(run.final_success), len(baseline)) > 1:
-            difference = bootstrap_difference(run.final_success, baseline, paired=paired)
+        baseline = first.returned_success[[order[seed] for seed in run.spec.seeds]] if paired else first.returned_success
+        if min(len(run.returned_success), len(baseline)) > 1:
+            difference = bootstrap_difference(run.returned_success, baseline, paired=paired)
         else:
-            difference = _without_interval(float(run.final_success.mean() - baseline.mean()))
+            difference = _without_interval(float(run.returned_success.mean() - baseline.mean()))
     steps = run.to_95("updates" if run.cloning else "steps")
-    final = run.final_success
+    final = run.returned_success
     return Comparison(
         run=run,
-        final_success=bootstrap(final) if len(final) > 1 else _without_interval(float(final[0])),
+        returned_success=bootstrap(final) if len(final) > 1 else _without_interval(float(final[0])),
         seeds_reaching_95=int(np.isfinite(steps).sum()),
         steps_to_95=float(np.median(steps)),
         seconds_to_95=float(np.median(run.to_95("seconds"))),

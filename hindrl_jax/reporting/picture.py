@@ -22,7 +22,7 @@ def save_comparison(runs: Sequence[RecordedRun], path: Path, *, over: Axis) -> N
             x, success = run.axis(over), 100 * run.success
             label = run.label if run.finished else f"{run.label} (not finished)"
             if not x.any():
-                axis.axhline(100 * run.final_success.mean(), color=colour, linestyle="--", linewidth=1.5, label=f"{label}, at its end")
+                axis.axhline(100 * run.returned_success.mean(), color=colour, linestyle="--", linewidth=1.5, label=f"{label}, at its end")
                 continue
             mean_line(axis, x, success, colour=colour, label=label, size=2.5)
             if success.shape[1] > 1:

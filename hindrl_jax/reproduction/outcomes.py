@@ -25,8 +25,8 @@ class Outcome:
     """Seeds of which an evaluation along the run was at 95% or more."""
     steps_to_95: Interval
     """Median of the environment steps to the first such evaluation; a seed without one counts as infinite."""
-    final_success: Interval
-    """Mean of the final policies' success in fresh episodes."""
+    returned_success: Interval
+    """Mean of the returned policies' success in fresh episodes."""
     mean_success: Interval
     """Mean over seeds of the success along the run: the area under the curve of its evaluations, see `success_along`."""
     difference: Interval
@@ -80,10 +80,10 @@ def _outcome(cell: Cell, run: RecordedRun, baseline: RecordedRun) -> Outcome:
         is_baseline=run is baseline,
         seeds_reaching_95=int(np.isfinite(steps_to_95).sum()),
         steps_to_95=bootstrap(steps_to_95, np.median),
-        final_success=bootstrap(run.final_success),
+        returned_success=bootstrap(run.returned_success),
         mean_success=bootstrap(along),
         difference=bootstrap(along - _success_along_of_seeds(baseline)),
-        seconds_per_seed=run.train_seconds / len(run.final_success),
+        seconds_per_seed=run.train_seconds / len(run.returned_success),
         relative_cost=(run.train_seconds / run.updates[-1]) / (baseline.train_seconds / baseline.updates[-1]),
     )
 

@@ -53,7 +53,7 @@ def _csv_row(outcome: Outcome, row_name: str) -> dict[str, Any]:
         "steps": spec.config.num_steps,
         "seeds_reaching_95": outcome.seeds_reaching_95,
     }
-    for name, field in (("median_steps_to_95", "steps_to_95"), *((name, name) for name in ("final_success", "mean_success", "difference"))):
+    for name, field in (("median_steps_to_95", "steps_to_95"), *((name, name) for name in ("returned_success", "mean_success", "difference"))):
         interval = getattr(outcome, field)
         row |= {name: f"{interval.estimate:.6g}", f"{name}_low": f"{interval.low:.6g}", f"{name}_high": f"{interval.high:.6g}"}
     return row | {"seconds_per_seed": f"{outcome.seconds_per_seed:.6g}", "relative_cost": f"{outcome.relative_cost:.6g}"}
@@ -70,7 +70,7 @@ def markdown(outcomes: Sequence[Outcome], *, row_name: str, title: Callable[[str
     lines = []
     for task, of_task in itertools.groupby(outcomes, key=lambda outcome: outcome.cell.task):
         lines += [f"## {task}: {title(task)}", ""]
-        lines += [f"| {row_name} | 95% | steps to 95% | final | along | difference | s/seed | cost |", "|---|---|---|---|---|---|---|---|"]
+        lines += [f"| {row_name} | 95% | steps to 95% | returned | along | difference | s/seed | cost |", "|---|---|---|---|---|---|---|---|"]
         for group, of_group in itertools.groupby(of_task, key=lambda outcome: outcome.cell.group):
             rows = list(of_group)
             if not rows[0].is_baseline:
@@ -91,7 +91,7 @@ def _markdown_row(outcome: Outcome) -> str:
         outcome.cell.name,
         f"{outcome.seeds_reaching_95}/{len(outcome.cell.spec.seeds)}",
         f"{thousands(steps.estimate, limit)} [{thousands(steps.low, limit)}, {thousands(steps.high, limit)}]",
-        _percent(outcome.final_success),
+        _percent(outcome.returned_success),
         _percent(outcome.mean_success),
         difference,
         f"{outcome.seconds_per_seed:.1f}",

@@ -33,8 +33,8 @@ class RecordedRun:
     """(E,) of training, all seeds side by side."""
     success: np.ndarray
     """(E, S) share of an evaluation's episodes that are solved."""
-    final_success: np.ndarray
-    """(S,) of 100 fresh episodes; of the last evaluation, if the run is not finished."""
+    returned_success: np.ndarray
+    """(S,) share of 100 fresh episodes that the returned policies solve; of the last evaluation's, if the run is not finished."""
     train_seconds: float
     """Of the whole training so far, evaluations included and compilation not."""
     finished: bool
@@ -65,7 +65,7 @@ def read_recorded(path: Path, label: str | None = None) -> RecordedRun:
         text = (path / METRICS).read_text()
         summary = json.loads((path / SUMMARY).read_text()) if (path / SUMMARY).exists() else None
         columns = _whole_evaluations(text, spec.seeds)
-        final = None if summary is None else np.asarray([float(seed["final_success"]) for seed in summary["seeds"]])
+        final = None if summary is None else np.asarray([float(seed["returned_success"]) for seed in summary["seeds"]])
         total = None if summary is None else float(summary["train_seconds"])
     except FileNotFoundError:
         raise UserError(f"{path} has no {METRICS} yet: wait for its first evaluation, or leave it out") from None
@@ -81,7 +81,7 @@ def read_recorded(path: Path, label: str | None = None) -> RecordedRun:
         updates=columns["updates"][:, 0].astype(int),
         seconds=columns["seconds"][:, 0],
         success=columns["success"],
-        final_success=columns["success"][-1] if final is None else final,
+        returned_success=columns["success"][-1] if final is None else final,
         train_seconds=float(columns["seconds"][-1, 0]) if total is None else total,
         finished=final is not None,
     )

@@ -67,9 +67,17 @@ class Reporter(abc.ABC):
             self._last = evaluation[0]
 
     def finish(self, summaries: Sequence[SeedSummary]) -> None:
-        """Shows what the 100 fresh episodes of the final policies (S of them) gave, and closes."""
-        final = [{"final/success": seed.final_success, "final/episode_length": seed.episode_length} for seed in summaries]
-        self._write(self._last.seconds, steps_of(self._last), final)
+        """Shows what 100 fresh episodes of the returned and of the last policies (S of each) gave, and closes."""
+        ends = [
+            {
+                "returned/success": seed.returned_success,
+                "returned/episode_length": seed.returned_length,
+                "final/success": seed.final_success,
+                "final/episode_length": seed.episode_length,
+            }
+            for seed in summaries
+        ]
+        self._write(self._last.seconds, steps_of(self._last), ends)
         self._close()
         self._num_seeds = 0
 

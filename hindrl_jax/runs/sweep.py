@@ -86,14 +86,14 @@ class SweepWriter:
         table = []
         for setting, writer, part in zip(self.settings, self.runs, parts, strict=True):
             seeds = writer.finish(part, film=False)["seeds"]
-            final = [seed["final_success"] for seed in seeds]
+            returned = [seed["returned_success"] for seed in seeds]
             steps = [seed[f"{unit}_to_95"] for seed in seeds if seed[f"{unit}_to_95"] is not None]
             outcome = {
                 "seeds": num_seeds,
                 "seeds_reaching_95": len(steps),
                 f"median_{unit.removeprefix('env_')}_to_95": float(np.median(steps)) if steps else None,
-                "mean_final_success": float(np.mean(final)),
-                "worst_final_success": min(final),
+                "mean_returned_success": float(np.mean(returned)),
+                "worst_returned_success": min(returned),
             }
             table.append(setting | outcome)
         with disk_trouble(self.path):

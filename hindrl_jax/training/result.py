@@ -60,8 +60,6 @@ class SeedSummary:
     returned_seconds: float
     final_success: float
     """Share of 100 fresh episodes that the last policy solves with its mean actions."""
-    best_success: float
-    """The best evaluation, the final one included."""
     env_steps_to_95: int | None
     updates_to_95: int | None
     seconds_to_95: float | None
@@ -166,7 +164,6 @@ class Result:
             returned_updates=int(self.returned.updates[index]),
             returned_seconds=float(self.returned.seconds[index]),
             final_success=float(self.final_success[index]),
-            best_success=max(float(self.final_success[index]), *(row.success for row in rows)),
             env_steps_to_95=None if first is None else first.env_steps,
             updates_to_95=None if first is None else first.updates,
             seconds_to_95=None if first is None else first.seconds,

@@ -18,7 +18,7 @@ from hindrl_jax.cli.train_options import parse_train
 from hindrl_jax.runs.reader import load_run
 from hindrl_jax.tasks import registry
 
-SEED_FIELDS = {"seed", "final_success", "best_success", "env_steps_to_95", "updates_to_95", "seconds_to_95", "episode_length", "evaluation_steps"}
+SEED_FIELDS = {"seed", "final_success", "env_steps_to_95", "updates_to_95", "seconds_to_95", "episode_length", "evaluation_steps"}
 SEED_FIELDS |= {f"returned_{what}" for what in ("success", "length", "noise", "env_steps", "updates", "seconds")}
 TOTALS = {"updates_per_second", "env_steps_per_second", "compile_seconds", "train_seconds", "peak_memory_bytes"}
 

@@ -30,7 +30,7 @@ def write(path, success, *, final=None, seeds=(0, 1), algo="hindrl", env=ENV, ev
     (path / "metrics.csv").write_text("\n".join(lines) + "\n")
     if final is not None:
         (path / "summary.json").write_text(
-            json.dumps({"seeds": [{"seed": s, "final_success": f} for s, f in zip(seeds, final, strict=True)], "train_seconds": 1.0})
+            json.dumps({"seeds": [{"seed": s, "returned_success": f} for s, f in zip(seeds, final, strict=True)], "train_seconds": 1.0})
         )
     return path
 
@@ -44,7 +44,7 @@ def test_figures_of_a_run(first):
     (one,) = compare(read_runs([first]))
     # seed 0 reaches 95% at its second evaluation and seed 1 at its third: 200 and 300 steps, 20 and 30 s
     assert (one.seeds_reaching_95, one.steps_to_95, one.seconds_to_95) == (2, 250.0, 25.0)
-    assert one.final_success == Interval(estimate=pytest.approx(0.95), low=0.9, high=1.0)
+    assert one.returned_success == Interval(estimate=pytest.approx(0.95), low=0.9, high=1.0)
     assert one.difference is None
 
 
@@ -75,7 +75,7 @@ def test_a_run_under_way_is_read_as_far_as_it_is_whole(first, tmp_path):
     run = read_runs([path])[0]
     assert not run.finished
     assert run.env_steps.tolist() == [100, 200]
-    assert run.final_success.tolist() == [0.25, 0.75]
+    assert run.returned_success.tolist() == [0.25, 0.75]
     assert "running is not finished: its success is that of the evaluation at 200 of 1,000 steps" in remarks(compare(read_runs([first, path])))
 
 

@@ -88,7 +88,7 @@ def test_the_bar_says_how_far_how_good_how_fast_and_how_long():
 
 def test_bc_counts_updates():
     assert play(console(), algo="bc").splitlines()[0] == "     400 updates     4.0 s   success   8% (worst   5%)   length  50.0"
-    seed = dict(seed=0, final_success=1.0, best_success=1.0, episode_length=50.0, env_steps_to_95=0, updates_to_95=1_500, seconds_to_95=2.0)
+    seed = dict(seed=0, final_success=1.0, episode_length=50.0, env_steps_to_95=0, updates_to_95=1_500, seconds_to_95=2.0)
     seed |= dict(returned_success=1.0, returned_length=49.0, returned_noise=0.0, returned_env_steps=0, returned_updates=1_000)
     screen = console()
     screen.print(training._summary_table({"seeds": [seed]}, dataclasses.replace(CONFIG, algo="bc")))

@@ -72,6 +72,8 @@ def test_tensorboard_reads_each_seed_and_their_mean(tmp_path):
         "critic/loss": [(100, 40.75), (200, 41.0)],
         "time/seconds": [(100, 25.0), (200, 50.0)],
         "time/updates": [(100, 10.0), (200, 20.0)],
+        "returned/success": [(200, 0.75)],
+        "returned/episode_length": [(200, 0.75)],
         "final/success": [(200, 0.75)],
         "final/episode_length": [(200, 42.0)],
     }
@@ -239,7 +241,7 @@ def test_the_writer_of_a_run_tells_its_reporters(tmp_path):
     writer.report(ROWS[:2])
     writer.report(ROWS)
     (reporter,) = writer.reporters
-    summary = dict(best_success=1.0, env_steps_to_95=None, updates_to_95=None, seconds_to_95=None, episode_length=1.0)
+    summary = dict(env_steps_to_95=None, updates_to_95=None, seconds_to_95=None, episode_length=1.0)
     summary |= {field.name: 0 for field in dataclasses.fields(SeedSummary) if field.name.startswith(("returned", "evaluation"))}
     reporter.finish([SeedSummary(seed=seed, final_success=0.5, **summary) for seed in (3, 4)])
     assert told == [("start", (3, 4)), (100, [0.25, 0.75]), (200, [0.5, 1.0]), (200, [0.5, 0.5]), "close"]

@@ -34,7 +34,7 @@ def write_run(cell, *, curves, final, seconds):
     for index, env_steps in enumerate((40, 80)):
         rows += [f"{seed},{env_steps},{env_steps // 4},1.0,{curve[index]}" for seed, curve in zip(cell.spec.seeds, curves, strict=True)]
     (cell.path / "metrics.csv").write_text("\n".join(rows) + "\n")
-    seeds = [{"final_success": value} for value in final]
+    seeds = [{"returned_success": value} for value in final]
     (cell.path / "summary.json").write_text(json.dumps({"seeds": seeds, "train_seconds": seconds}))
 
 
@@ -60,7 +60,7 @@ def test_outcomes_by_hand(by_hand):
     assert (baseline.seeds_reaching_95, baseline.seconds_per_seed, baseline.relative_cost, baseline.verdict()) == (1, 5.0, 1.0, "open")
     # 0.1 and 0.04, so 0.3 and 0.2 less than the baseline's.
     assert worse.difference == Interval(pytest.approx(-0.25), pytest.approx(-0.3), pytest.approx(-0.2))
-    assert worse.final_success == Interval(0.5, 0.5, 0.5)
+    assert worse.returned_success == Interval(0.5, 0.5, 0.5)
     assert (worse.seeds_reaching_95, worse.relative_cost, worse.verdict()) == (0, 3.0, "worse")
     assert better.steps_to_95 == Interval(40.0, 40.0, 40.0)
     assert (better.seeds_reaching_95, better.relative_cost, better.verdict()) == (2, 0.5, "better")
@@ -92,7 +92,7 @@ def test_markdown_by_hand(by_hand):
     assert markdown(outcomes_of(by_hand), row_name="change", title=lambda task: f"the {task} one") == [
         "## small: the small one",
         "",
-        "| change | 95% | steps to 95% | final | along | difference | s/seed | cost |",
+        "| change | 95% | steps to 95% | returned | along | difference | s/seed | cost |",
         "|---|---|---|---|---|---|---|---|",
         "| default | 1/2 | >0k [0k, >0k] | 95.0 [90.0, 100.0] | 32.0 [24.0, 40.0] |  | 5.0 | 1.00 |",
         "| *targets* | | | | | | | |",
