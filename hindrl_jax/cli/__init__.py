@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import sys
 import warnings
 from collections.abc import Callable
@@ -39,12 +40,18 @@ COMMANDS: dict[str, Command | dict[str, Command]] = {
 }
 
 
+_STEPS = """\
+start with:
+  hindrl train --env FixedGridPickAndPlace --demos 1 --stop-at 0.98 --out runs/first
+  hindrl render runs/first"""
+
+
 def _usage() -> str:
-    lines = [f"hindrl {__version__}: learn sparse-reward tasks from a handful of demonstrations", ""]
+    lines = [f"hindrl {__version__}: learn sparse-reward tasks from a handful of demonstrations", "", "commands:"]
     for name, command in COMMANDS.items():
         for words, function in [(name, command)] if callable(command) else [(f"{name} {sub}", f) for sub, f in command.items()]:
             lines.append(f"  hindrl {words:<20}{function.__doc__}")
-    return "\n".join([*lines, "", "Each takes --help."])
+    return "\n".join([*lines, "", _STEPS, "", "`hindrl COMMAND --help` explains a command, `hindrl --version` prints the version."])
 
 
 def _find(arguments: list[str]) -> tuple[Command, list[str]]:
@@ -77,8 +84,11 @@ def main(arguments: list[str] | None = None) -> None:
     if arguments is None:
         arguments = sys.argv[1:]
         _set_up_jax()
-    *group, last = arguments or [""]
+    *group, last = arguments or ["--help"]
     try:
+        if arguments in (["--version"], ["-V"], ["version"]):
+            print(f"hindrl_jax {__version__}, jax {jax.__version__}, Python {platform.python_version()}", flush=True)
+            return
         if last in ("--help", "-h") and (not group or (len(group) == 1 and isinstance(COMMANDS.get(group[0]), dict))):
             print(_usage(), flush=True)
             return
