@@ -69,7 +69,9 @@ def command_line() -> str:
     os.environ["COLUMNS"] = str(WIDTH)
     from hindrl_jax.cli import COMMANDS
 
-    intro = "What each command answers to `--help-all`; `hindrl train --help` is shorter. Flags of the environment and of the config follow from `--env`."
+    intro = (
+        "What each command answers to `--help-all`; `hindrl train --help` is shorter. Flags of the environment and of the config follow from `--env`."
+    )
     sections = ["# Command line", intro]
     for name, command in COMMANDS.items():
         for words, function in [((name,), command)] if callable(command) else [((name, sub), f) for sub, f in command.items()]:
