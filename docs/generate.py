@@ -15,7 +15,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 OUT = ROOT / "docs" / "generated"
-WIDTH = 86  # characters, of the help texts: as many as a page shows without scrolling
+WIDTH = 101  # characters, of the help texts
 
 # Files shown as pages, with the links in them that lead elsewhere in the site. A link to a file that is no page is shown without its link.
 PAGES = {
@@ -74,13 +74,52 @@ def command_line() -> str:
     )
     sections = ["# Command line", intro]
     for name, command in COMMANDS.items():
-        for words, function in [((name,), command)] if callable(command) else [((name, sub), f) for sub, f in command.items()]:
-            sections += [f"## hindrl {' '.join(words)}", str(function.__doc__), f"```text\n{help_text(words)}\n```"]
+        for words in [(name,)] if callable(command) else [(name, sub) for sub in command]:
+            sections += [f"## hindrl {' '.join(words)}", *as_lists(help_text(words))]
             if words in (("train",), ("demos", "record")):
                 for env, what in (("FixedParameterizedReach", "the arm"), ("BringNear", "two arms and cables")):
                     answer = help_text((*words, "--env", env))
-                    sections += [f"### hindrl {' '.join(words)}, for {what}", f"With `--env {env}`:", f"```text\n{answer}\n```"]
+                    sections += [f"## hindrl {' '.join(words)}, for {what}", f"With `--env {env}`:", *as_lists(answer)]
     return "\n\n".join(sections) + "\n"
+
+
+def as_lists(text: str) -> list[str]:
+    """A help page as Markdown: a heading for each group, and a list of its options."""
+    usage, _, *lines = text.splitlines()
+    parts = [f"```text\n{usage}\n```"]
+    head = body = ""
+    items: list[str] = []
+    prose = False  # whether the last line was of a paragraph
+
+    def end_item() -> None:
+        nonlocal head, body
+        if head:
+            items.append(f"- `{head}`{': ' if body else ''}{body}")
+        head = body = ""
+
+    def end_list() -> None:
+        end_item()
+        parts.extend(["\n".join(items)] if items else [])
+        items.clear()
+
+    for line in lines:
+        if line.startswith(" " * 6):
+            body = f"{body} {line.strip()}".strip()
+        elif line.startswith(" " * 4):
+            head += line.strip()
+        elif line.startswith("  ") and (line.startswith("  --") or line.strip().isupper()):
+            end_item()
+            head = line.strip()
+        elif line.endswith(":") and not line.startswith(" "):
+            end_list()
+            parts.append(f"**{line[:-1].capitalize()}**")
+        elif line and prose:
+            parts[-1] += f" {line.strip()}"
+        elif line:
+            parts.append(line.strip())
+        prose = bool(line) and not items and not head and not line.endswith(":")
+    end_list()
+    return parts
 
 
 def help_text(words: tuple[str, ...]) -> str:
