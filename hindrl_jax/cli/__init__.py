@@ -17,7 +17,7 @@ import jax
 from hindrl_jax import __version__
 from hindrl_jax.base.compilation import keep_compiled_programs
 from hindrl_jax.base.errors import UserError, one_line
-from hindrl_jax.cli import comparison, demonstrations, environments, inspection, playing, reproduction, sweeping, training
+from hindrl_jax.cli import comparison, demonstrations, environments, inspection, playing, policies, reproduction, sweeping, training
 from hindrl_jax.cli.signals import interrupts_that_last
 from hindrl_jax.tasks.registry import did_you_mean
 
@@ -37,11 +37,13 @@ COMMANDS: dict[str, Command | dict[str, Command]] = {
     },
     "reproduce": {"ablation": reproduction.ablate},
     "envs": environments.show,
+    "policies": policies.show,
 }
 
 
 _STEPS = """\
 start with:
+  hindrl render policy:FixedParameterizedReach
   hindrl train --env FixedGridPickAndPlace --demos 1 --stop-at 0.98 --out runs/first
   hindrl render runs/first"""
 

@@ -14,6 +14,7 @@ from toy_env import Corridor, corridor_demonstrations
 
 import hindrl_jax as hindrl
 from hindrl_jax import cli
+from hindrl_jax.cli.policies import shipped
 from hindrl_jax.cli.train_options import parse_train
 from hindrl_jax.cli.training import nothing_solved
 from hindrl_jax.runs.reader import load_run
@@ -231,3 +232,26 @@ def test_existing_run_is_refused_and_kept(run, capsys):
     refusal(capsys, "train", "--out", run, "--overwrite", "--demos", "missing.hdf5", *TINY)
     refusal(capsys, "train", "--out", run, "--overwrite", "--buffer-size", "100")
     assert {file.name: file.read_bytes() for file in run.iterdir()} == before
+
+
+def test_policies_that_ship_are_listed_and_small(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    cli.main(["policies"])
+    printed = capsys.readouterr().out
+    assert {"FixedGridPickAndPlace", "FixedParameterizedReach"} <= set(shipped())
+    for name, path in shipped().items():
+        assert f" {name} " in printed
+        assert sum(file.stat().st_size for file in path.iterdir()) < 1_000_000
+        assert load_run(path).spec.env.name == name
+    cli.main(["eval", "policy:FixedGridPickAndPlace", "--episodes", "20"])
+    assert " 2      100.0%" in capsys.readouterr().out
+    cli.main(["render", "policy:FixedGridPickAndPlace"])
+    assert (tmp_path / "FixedGridPickAndPlace_episode_0_seed_2.gif").stat().st_size > 0
+    assert "did you mean 'FixedParameterizedReach'?" in refusal(capsys, "render", "policy:ParameterizedReach")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", shipped())
+def test_policies_that_ship_solve_their_tasks(name):
+    (outcome,) = load_run(shipped()[name]).evaluate(episodes=100)
+    assert outcome["success"] >= (0.85 if name == "BringNear" else 0.98)
