@@ -1,5 +1,6 @@
 """The command line as a whole: interrupts, refusals, and what it lists."""
 
+import shlex
 import signal
 import subprocess
 import sys
@@ -108,6 +109,24 @@ def test_without_arguments_it_says_what_there_is(capsys):
 def test_it_says_its_version(capsys):
     cli.main(["--version"])
     assert capsys.readouterr().out.startswith(f"hindrl_jax {__version__}, jax ")
+
+
+def completions(script, line):
+    """What bash offers at the end of a line."""
+    words = line.split(" ")
+    asked = f"COMP_WORDS=({' '.join(map(shlex.quote, words))}); COMP_CWORD={len(words) - 1}; _hindrl; printf '%s\\n' \"${{COMPREPLY[@]}}\""
+    return subprocess.run(["bash", "-c", f"{script}\n{asked}"], capture_output=True, text=True, check=True).stdout.split()
+
+
+def test_the_shell_completes(capsys):
+    cli.main(["completion"])
+    script = capsys.readouterr().out
+    assert completions(script, "hindrl tr") == ["train"]
+    assert completions(script, "hindrl demos re") == ["record", "render"]
+    assert completions(script, "hindrl train --env Fixed") == ["FixedGridPickAndPlace", "FixedParameterizedReach"]
+    assert completions(script, "hindrl train --learning-r") == ["--learning-rate"]
+    assert completions(script, "hindrl train --seeds 3 --algo sm") == ["smooth-hindrl"]
+    assert completions(script, "hindrl demos record --ou") == ["--out"]
 
 
 def test_the_installed_command_starts():
