@@ -44,7 +44,8 @@ def site(tmp_path_factory):
 def test_site_builds_without_a_warning(site):
     core = (site / "site" / "api" / "core.html").read_text()
     assert "Half-width of the goal box per dimension (thesis eq. 4.7)" in core
-    assert "(B,), factor of the bootstrapped value" in (site / "site" / "api" / "base.html").read_text()  # a shape comment behind a field of Transition
+    base = (site / "site" / "api" / "base.html").read_text()
+    assert "(B,), factor of the bootstrapped value" in base  # a shape comment behind a field of Transition
     commands = (site / "site" / "generated" / "command-line.html").read_text()
     assert "--hindrl-sampling-strategy" in commands
     assert "\x1b" not in commands
