@@ -14,7 +14,7 @@ NEWEST_PIP = $(subst .venv,.venv-newest,$(PIP)) --upgrade --upgrade-strategy eag
 NEWEST_EXTRAS = .[minari,tensorboard,video]
 NEWEST_TOOLS = pytest pytest-xdist hypothesis ipython
 
-.PHONY: train test test-newest test-versions test-slow test-interop coverage lint docs package bench clean
+.PHONY: train test test-newest test-versions test-slow test-interop coverage lint docs check-docs package bench clean
 
 train: .venv/.installed  ## one demonstration, one seed, until it is solved: under a minute
 	.venv/bin/hindrl train --env FixedGridPickAndPlace --algo hindrl --demos 1 --seed 2 --stop-at 0.98 --out runs/quickstart --overwrite
@@ -46,6 +46,9 @@ lint: .venv/.installed-test
 docs: .venv/.installed-test  ## site/index.html; a warning is an error
 	.venv/bin/python docs/generate.py
 	NO_MKDOCS_2_WARNING=1 .venv/bin/python -m mkdocs build --strict
+
+check-docs: docs  ## the site in a browser without a screen, at two widths: what sticks out, leads nowhere or does not load; needs chromium
+	.venv/bin/python docs/check_site.py
 
 package: .venv/.installed-test  ## wheel and sdist in dist/, each tried in an environment of its own
 	rm -rf build/lib dist

@@ -41,7 +41,7 @@ PEERS = {
 
 
 class Worker:
-    """A process that takes gradient steps when told to, see `peers/protocol.py`."""
+    """A process that takes gradient steps on request, see `peers/protocol.py`."""
 
     def __init__(self, command: Sequence[str | Path], environment: dict[str, str]):
         self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115 (closed by `close`)

@@ -1,6 +1,6 @@
 """Writes docs/generated/: the pages that come from elsewhere in the project, so that they cannot go stale. `make docs` runs it first.
 
-The command line's page is what each command answers to --help; notebooks become pages without their outputs, since none are stored.
+The command line's page is what each command answers to --help-all; notebooks become pages without their outputs, since none are stored.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 OUT = ROOT / "docs" / "generated"
-WIDTH = 110  # characters, of the help texts
+WIDTH = 101  # characters, of the help texts
 
 # Files shown as pages, with the links in them that lead elsewhere in the site. A link to a file that is no page is shown without its link.
 PAGES = {
@@ -65,31 +65,73 @@ def notebook(path: Path) -> str:
 
 
 def command_line() -> str:
-    """Every command's answer to --help."""
-    os.environ["COLUMNS"] = str(WIDTH)  # read by argparse's and rich's formatters
+    """Every command's answer to --help-all."""
+    os.environ["COLUMNS"] = str(WIDTH)
     from hindrl_jax.cli import COMMANDS
 
-    sections = ["# Command line", "What each command answers to `--help`. Flags of the environment and of the config follow from its `--env`."]
+    intro = (
+        "What each command answers to `--help-all`; `hindrl train --help` is shorter. Flags of the environment and of the config follow from `--env`."
+    )
+    sections = ["# Command line", intro]
     for name, command in COMMANDS.items():
-        for words, function in [((name,), command)] if callable(command) else [((name, sub), f) for sub, f in command.items()]:
-            sections += [f"## hindrl {' '.join(words)}", str(function.__doc__), f"```text\n{help_text(words)}\n```"]
+        for words in [(name,)] if callable(command) else [(name, sub) for sub in command]:
+            sections += [f"## hindrl {' '.join(words)}", *as_lists(help_text(words))]
             if words in (("train",), ("demos", "record")):
                 for env, what in (("FixedParameterizedReach", "the arm"), ("BringNear", "two arms and cables")):
                     answer = help_text((*words, "--env", env))
-                    sections += [f"### hindrl {' '.join(words)}, for {what}", f"With `--env {env}`:", f"```text\n{answer}\n```"]
+                    sections += [f"## hindrl {' '.join(words)}, for {what}", f"With `--env {env}`:", *as_lists(answer)]
     return "\n\n".join(sections) + "\n"
 
 
+def as_lists(text: str) -> list[str]:
+    """A help page as Markdown: a heading for each group, and a list of its options."""
+    usage, _, *lines = text.splitlines()
+    parts = [f"```text\n{usage}\n```"]
+    head = body = ""
+    items: list[str] = []
+    prose = False  # whether the last line was of a paragraph
+
+    def end_item() -> None:
+        nonlocal head, body
+        if head:
+            items.append(f"- `{head}`{': ' if body else ''}{body}")
+        head = body = ""
+
+    def end_list() -> None:
+        end_item()
+        parts.extend(["\n".join(items)] if items else [])
+        items.clear()
+
+    for line in lines:
+        if line.startswith(" " * 6):
+            body = f"{body} {line.strip()}".strip()
+        elif line.startswith(" " * 4):
+            head += line.strip()
+        elif line.startswith("  ") and (line.startswith("  --") or line.strip().isupper()):
+            end_item()
+            head = line.strip()
+        elif line.endswith(":") and not line.startswith(" "):
+            end_list()
+            parts.append(f"**{line[:-1].capitalize()}**")
+        elif line and prose:
+            parts[-1] += f" {line.strip()}"
+        elif line:
+            parts.append(line.strip())
+        prose = bool(line) and not items and not head and not line.endswith(":")
+    end_list()
+    return parts
+
+
 def help_text(words: tuple[str, ...]) -> str:
-    """What `hindrl WORDS --help` prints, as plain text."""
+    """What `hindrl WORDS --help-all` prints."""
     from hindrl_jax import cli
 
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
-        cli.main([*words, "--help"])
-    text = re.sub(r"\x1b\[[0-9;]*m", "", printed.getvalue()).rstrip()
+        cli.main([*words, "--help-all"])
+    text = printed.getvalue().rstrip()
     if not text.startswith("usage: hindrl"):
-        raise RuntimeError(f"hindrl {' '.join(words)} --help printed no help: {text[:200]!r}")
+        raise RuntimeError(f"hindrl {' '.join(words)} --help-all printed no help: {text[:200]!r}")
     return "\n".join(line.rstrip() for line in text.splitlines())
 
 

@@ -1,4 +1,4 @@
-"""The scripted, human-like expert of the grid worlds (thesis section 4.2.1): perfect at grabbing, clumsy at moving.
+"""The scripted, human-like expert of the grid worlds (thesis section 4.2.1): exact when it grabs, noisy when it moves.
 
 Differences from the thesis: none by default. The original code moves at random on the step that releases a delivered object;
 `random_move_on_release=True` gives that, and with it the original's episode lengths.

@@ -1,6 +1,6 @@
 """Strict settings for every test: no silent broadcasting between ranks, no random key consumed twice.
 
-The programs of the fast tests are small and run for an instant, so the compiler is told to take little trouble over them, also in processes that
+The programs of the fast tests are small and run for an instant, so the compiler is set to optimise them little, also in processes that
 tests start.
 """
 

@@ -32,7 +32,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import Logger
 
 NUM_TRANSITIONS = 20_000
-WARM_UP_CALLS = 2  # SBX compiles in the first and looks its program up anew in the second
+WARM_UP_CALLS = 2  # SBX compiles in the first and looks its program up again in the second
 
 
 class RandomBox(gymnasium.Env):

@@ -9,7 +9,7 @@ drop * num_critics of them.
 Two settings of the environment change what is measured. Both are left to the caller, because their defaults are what a user of SB3 gets:
 
 - MALLOC_MMAP_THRESHOLD_=2000000000 MALLOC_TRIM_THRESHOLD_=4000000000 (glibc): at batch 4096 the tensors of the pairwise loss take 38 MB each, and
-  glibc by default hands such memory back to the system and fetches it anew at every use. With these two a step takes a third of the time (110 ms in
+  glibc by default hands such memory back to the system and fetches it again at every use. With these two a step takes a third of the time (110 ms in
   place of 360 on two cores) and yields the same numbers bit for bit.
 - OMP_WAIT_POLICY=passive: PyTorch's threads by default spin while they wait for work, and CPU time counts that, many times over if they wait for a
   core that something else keeps busy. Passive ones sleep; CPU time falls a little and wall-clock time rises.

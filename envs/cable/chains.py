@@ -1,4 +1,4 @@
-"""The state of the MuJoCo model, for both of its back ends: where everything is, and what its actuators are told. Pure and unbatched.
+"""The state of the MuJoCo model, for both of its back ends: where everything is, and the commands of its actuators. Pure and unbatched.
 
 Joints stand in the model's order: for each arm seven joints and two fingers, then for each cable two hinges per link and three of its head.
 """
@@ -50,7 +50,7 @@ def arms(physics: Joints) -> tuple[Array, Array]:
 
 
 def controls(physics: Joints, rest: Array, finger_targets: Array, command: Array) -> Array:
-    """(18,) what the actuators are told for a control step; arguments as those of `closed_form.control_step`."""
+    """(18,) commands of the actuators for a control step; arguments as those of `closed_form.control_step`."""
     joints, _ = arms(physics)
     goals = jax.vmap(panda.joint_targets)(joints, rest, command, jax.vmap(panda.posture)(joints))
     return jnp.concatenate([goals, jnp.stack([finger_targets, -finger_targets], axis=1)], axis=1).reshape(-1)

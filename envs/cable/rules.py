@@ -61,7 +61,7 @@ class CableTask(abc.ABC):
     observation: Literal["full", "thesis"] = "full"
     """What is observed: all that the task depends on, or the original code's 31 numbers."""
     randomised: bool = False
-    """Whether the cables' weight, and how the socket takes the plug, are drawn anew for each episode, within 30%; only in closed form."""
+    """Whether the cables' weight, and how the socket takes the plug, are drawn again for each episode, within 30%; only in closed form."""
     num_links: int = 5
     """Links of each cable in MuJoCo; the closed form's have none."""
     backend: Backend = "closed_form"

@@ -17,7 +17,7 @@ from hindrl_jax.base.types import Array, TimeStep
 
 @runtime_checkable
 class Environment(Protocol):
-    """A goal-conditioned task, whoever steps it. Implementations are frozen dataclasses: hashable, and static under `jax.jit`."""
+    """A goal-conditioned task, stepped in JAX or outside it. Implementations are frozen dataclasses: hashable, and static under `jax.jit`."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
 

@@ -1,4 +1,4 @@
-"""Environments that are stepped outside JAX, many at once, by whatever code they have: a simulator in C, or Python of somebody else's."""
+"""Environments that are stepped outside JAX, many at once, by code outside this project: a simulator in C, or another Python package."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Outcome:
 
 
 class Stepper(Protocol):
-    """E environments side by side, each of which begins anew as soon as its episode ends."""
+    """E environments side by side, each of which starts a new episode as soon as its episode ends."""
 
     @property
     def num_envs(self) -> int: ...
@@ -46,7 +46,7 @@ class Stepper(Protocol):
 class WatchedStepper(Stepper, Protocol):
     """One environment with its raw observations, for an expert, and with pictures."""
 
-    def step(self, actions: np.ndarray, *, begin_anew: bool = True) -> Outcome:
+    def step(self, actions: np.ndarray, *, autoreset: bool = True) -> Outcome:
         """As of `Stepper`, but a new episode begins only if it is to, so that the last state can be looked at."""
 
     def raw_observation(self) -> Any:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import sys
 import warnings
 from collections.abc import Callable
@@ -16,7 +17,7 @@ import jax
 from hindrl_jax import __version__
 from hindrl_jax.base.compilation import keep_compiled_programs
 from hindrl_jax.base.errors import UserError, one_line
-from hindrl_jax.cli import comparison, demonstrations, environments, inspection, playing, reproduction, sweeping, training
+from hindrl_jax.cli import comparison, completion, demonstrations, environments, inspection, playing, policies, reproduction, sweeping, training
 from hindrl_jax.cli.signals import interrupts_that_last
 from hindrl_jax.tasks.registry import did_you_mean
 
@@ -36,15 +37,26 @@ COMMANDS: dict[str, Command | dict[str, Command]] = {
     },
     "reproduce": {"ablation": reproduction.ablate},
     "envs": environments.show,
+    "policies": policies.show,
 }
 
 
+_STEPS = """\
+start with:
+  hindrl render policy:FixedParameterizedReach
+  hindrl train --env FixedGridPickAndPlace --demos 1 --stop-at 0.98 --out runs/first
+  hindrl render runs/first"""
+
+
+_COMPLETION = 'In bash, `eval "$(hindrl completion)"` has Tab complete commands, options and tasks.'
+
+
 def _usage() -> str:
-    lines = [f"hindrl {__version__}: learn sparse-reward tasks from a handful of demonstrations", ""]
+    lines = [f"hindrl {__version__}: learn sparse-reward tasks from a handful of demonstrations", "", "commands:"]
     for name, command in COMMANDS.items():
         for words, function in [(name, command)] if callable(command) else [(f"{name} {sub}", f) for sub, f in command.items()]:
             lines.append(f"  hindrl {words:<20}{function.__doc__}")
-    return "\n".join([*lines, "", "Each takes --help."])
+    return "\n".join([*lines, "", _STEPS, "", "`hindrl COMMAND --help` explains a command, `hindrl --version` prints the version.", _COMPLETION])
 
 
 def _find(arguments: list[str]) -> tuple[Command, list[str]]:
@@ -77,8 +89,14 @@ def main(arguments: list[str] | None = None) -> None:
     if arguments is None:
         arguments = sys.argv[1:]
         _set_up_jax()
-    *group, last = arguments or [""]
+    *group, last = arguments or ["--help"]
     try:
+        if arguments in (["--version"], ["-V"], ["version"]):
+            print(f"hindrl_jax {__version__}, jax {jax.__version__}, Python {platform.python_version()}", flush=True)
+            return
+        if arguments == ["completion"]:
+            print(completion.script(COMMANDS), flush=True)
+            return
         if last in ("--help", "-h") and (not group or (len(group) == 1 and isinstance(COMMANDS.get(group[0]), dict))):
             print(_usage(), flush=True)
             return

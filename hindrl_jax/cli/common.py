@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import jax
@@ -13,10 +13,12 @@ import tyro
 from rich.console import Console
 
 from hindrl_jax.base.errors import UserError
+from hindrl_jax.cli.help_pages import full_page, groups_of, missing, nearest, short_page
 from hindrl_jax.tasks.registry import TASKS
 
 _TYRO = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
 ENV_HELP = "The environment; `hindrl envs` lists them. Any goal-conditioned one of Gymnasium is gymnasium:ID, as in gymnasium:FetchReach-v4."
+Brief = tuple[Mapping[str, Mapping[str, str]], Sequence[str]]  # as `short_page` takes them
 console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
 
 
@@ -49,20 +51,38 @@ def episode_key(seed: int) -> jax.Array:
     return jax.random.key(seed)
 
 
-def parse(arguments_class: type[Any], arguments: list[str], program: str, description: str | None = None) -> Any:
-    """tyro, with its page of explanation on a mistake cut down to one line."""
+def parse(arguments_class: type[Any], arguments: list[str], program: str, description: str | None = None, brief: Brief | None = None) -> Any:
+    """tyro, with its page of explanation on a mistake cut down to one line, and help pages of our own.
+
+    Args:
+      arguments_class: a dataclass.
+      arguments: what was typed after the command.
+      program: the command, for example "hindrl train".
+      description: one sentence; the docstring of the class by default.
+      brief: the options and the examples that --help shows, where it is not to show all of them; --help-all does.
+
+    Raises:
+      UserError: for what cannot be understood.
+      SystemExit: after a help page, with code 0.
+    """
+    asked = {"-h", "--help", "--help-all"} & set(arguments)
+    if asked:
+        groups, said = groups_of(arguments_class), description or arguments_class.__doc__ or ""
+        print(short_page(program, said, groups, *brief) if brief and "--help-all" not in asked else full_page(program, said, groups))
+        raise SystemExit(0)
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
-            return tyro.cli(arguments_class, args=arguments, prog=program, description=description, config=_TYRO)
-    except SystemExit as stop:
-        if stop.code in (0, None):
-            raise
-        raise UserError(_first_sentence(complaint.getvalue()) + f" (see {program} --help)") from None
+            return tyro.cli(arguments_class, args=arguments, prog=program, config=_TYRO)
+    except SystemExit:
+        said, lacking = _first_sentence(complaint.getvalue(), arguments_class), missing(arguments, groups_of(arguments_class))
+        if said.startswith("Missing") and lacking:
+            said = f"{program} needs {', '.join(lacking)}"
+        raise UserError(f"{said} (see {program} --help)") from None
 
 
-def _first_sentence(complaint: str) -> str:
-    """The message of tyro's box, and the flag it suggests, if any. Where the terminal is not known to speak UTF-8, the box has no visible border."""
+def _first_sentence(complaint: str, arguments_class: type[Any]) -> str:
+    """The message of tyro's box, and the option that was probably meant. Where the terminal is not known to speak UTF-8, the box has no border."""
     bordered = "│" in complaint
     lines = [line.strip("│ ") for line in complaint.splitlines() if line.startswith("│") or not bordered]
     sections: list[list[str]] = [[]]
@@ -71,10 +91,11 @@ def _first_sentence(complaint: str) -> str:
             sections.append([])
         elif line:
             sections[-1].append(line)
-    message, *rest = sections if bordered else sections[1:]  # without a border, the title is a section of its own
+    message, *_ = sections if bordered else sections[1:]  # without a border, the title is a section of its own
     text = re.sub(r"^Error parsing (?!-)\S+: ", "", " ".join(message))
-    suggestion = next((line.split()[0] for section in rest for line in section if line.startswith("--")), None)
-    return f"{text} (did you mean {suggestion}?)" if suggestion and text.startswith("Unrecognized") else text
+    unknown = re.search(r"--\S+", text) if text.startswith("Unrecognized") else None
+    meant = nearest(unknown[0], groups_of(arguments_class)) if unknown else None
+    return f"{text} (did you mean {meant}?)" if meant else text
 
 
 def counted(number: int, noun: str) -> str:

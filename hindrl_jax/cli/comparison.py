@@ -22,6 +22,16 @@ from hindrl_jax.reporting.picture import save_comparison
 from hindrl_jax.runs.recorded import Axis
 
 _MOST_CHANGES = 6  # that are named for each run
+_UNSET = {  # what a field means where it is None
+    "action_hold": "chosen by the run",
+    "epsilon": "by the demonstrations",
+    "final_target_entropy": "constant",
+    "num_target_critics": "all",
+    "reach_zero": "never",
+    "steps": "by default",
+    "stop_at": "never",
+    "updates_per_iteration": "by default",
+}
 _TABLE_WIDTH = 160  # at most, also where the terminal is narrower: a cell in two lines is hard to compare
 
 
@@ -93,10 +103,12 @@ def _interval(interval: Interval, form: str) -> str:
 def _changes_line(changed: dict[str, tuple[object, object]]) -> str:
     if not changed:
         return "asked for the same"
-    named = [f"{name} {_said(own)} instead of {_said(first)}" for name, (own, first) in list(changed.items())[:_MOST_CHANGES]]
+    named = [f"{name} {_said(name, own)} instead of {_said(name, first)}" for name, (own, first) in list(changed.items())[:_MOST_CHANGES]]
     left = len(changed) - len(named)
     return ", ".join(named) + (f", and {left} more" if left else "")
 
 
-def _said(value: object) -> str:
-    return "nothing" if value is None else " ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+def _said(name: str, value: object) -> str:
+    if value is None:
+        return _UNSET.get(name, "not set")
+    return (" ".join(map(str, value)) or "none") if isinstance(value, list | tuple) else str(value)

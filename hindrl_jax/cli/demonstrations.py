@@ -1,4 +1,4 @@
-"""`hindrl demos record`, `convert` and `render`; what they hold is told by `hindrl_jax.cli.inspection`."""
+"""`hindrl demos record`, `convert` and `render`; `hindrl_jax.cli.inspection` shows what they hold."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
@@ -13,17 +13,19 @@ import tyro
 from rich import box
 from rich.table import Table
 
+from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.files import disk_trouble
 from hindrl_jax.cli.common import console, counted
 from hindrl_jax.cli.demonstrations import beside, check_demo, parse_with_meaning
+from hindrl_jax.cli.dimension_names import dimension_names
 from hindrl_jax.core.goals import epsilon_filter, epsilon_from_demonstrations, is_visited
 from hindrl_jax.demonstrations.convert import open_source, read, understand
 from hindrl_jax.demonstrations.episodes import padded
 from hindrl_jax.demonstrations.foreign import ForeignRecording, Interpretation
 from hindrl_jax.demonstrations.recording import Recording, summarise_recording
 from hindrl_jax.plotting.curves import save_filter
-from hindrl_jax.tasks.registry import TASKS
+from hindrl_jax.tasks.registry import TASKS, make
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,18 +95,34 @@ def _print_recording(options: Info, recording: Recording) -> None:
         console.print(f"converted from {recording.converted_from['format']}")
     console.print(f"the filter keeps {int(jnp.sum(kept))} of {int(jnp.sum(lengths + 1))} goals ({_how(options)})")
     reached = np.concatenate([demo.achieved_goals for demo in recording.demonstrations])
-    columns = {
-        "observation": _ranges(summary.observation_low, summary.observation_high),
-        "goal": _ranges(reached.min(axis=0), reached.max(axis=0)),
-        "epsilon": [f"{value:.3g}" for value in epsilon],
-        "action": _ranges(summary.action_low, summary.action_high),
-    }
-    table = Table("dim", *columns, box=box.SIMPLE_HEAD)
+    names = dimension_names(_environment_of(recording))
+    goal = {"range": _ranges(reached.min(axis=0), reached.max(axis=0)), "epsilon": [f"{value:.3g}" for value in epsilon]}
+    if names.observation and names.observation == names.goal:
+        _print_table("observation, achieved goal", names.goal, goal)
+    else:
+        _print_table("observation", names.observation, {"range": _ranges(summary.observation_low, summary.observation_high)})
+        _print_table("achieved goal", names.goal, goal)
+    _print_table("action", names.action, {"range": _ranges(summary.action_low, summary.action_high)})
+
+
+def _print_table(what: str, names: Sequence[str], columns: dict[str, list[str]]) -> None:
+    """A row for each dimension, by its number and, if it is known, its name."""
+    named = len(names) == len(next(iter(columns.values())))
+    columns = {what: list(names), **columns} if named else columns
+    table = Table("dim" if named else what, *columns, box=box.SIMPLE_HEAD)
     for column in table.columns:
         column.no_wrap = True
-    for index, row in enumerate(itertools.zip_longest(*columns.values(), fillvalue="")):
+    for index, row in enumerate(zip(*columns.values(), strict=True)):
         table.add_row(str(index), *row)
     console.print(table)
+
+
+def _environment_of(recording: Recording) -> Environment | None:
+    """The environment of a recording; None if it cannot be made here."""
+    try:
+        return make(recording.env_name, **recording.env_kwargs) if recording.env_name in TASKS else None
+    except UserError:
+        return None
 
 
 def _ranges(low: np.ndarray, high: np.ndarray) -> list[str]:
@@ -147,8 +165,10 @@ def plot(arguments: list[str]) -> None:
     _, _, epsilon = _goals(recording, options)
     kept = np.asarray(epsilon_filter(jnp.asarray(goals, jnp.float32), epsilon))
     title = f"{recording.env_name}, demonstration {options.demo}, {_how(options)}"
+    names = dimension_names(_environment_of(recording)).goal
+    labels = [names[dim] if len(names) == goals.shape[1] else f"goal dimension {dim}" for dim in dims]
     with disk_trouble(path):
-        save_filter(goals, kept, np.asarray(epsilon), path, dims=dims, title=title)
+        save_filter(goals, kept, np.asarray(epsilon), path, dims=dims, labels=labels, title=title)
     console.print(f"wrote {path}: the filter keeps {kept.sum()} of {len(kept)} goals")
 
 

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.cli.common import console, counted, episode_key, parse
+from hindrl_jax.cli.policies import PREFIX, run_directory
 from hindrl_jax.runs.reader import load_run
 from hindrl_jax.training.playing import plays_one_by_one
 
@@ -21,8 +22,8 @@ from hindrl_jax.training.playing import plays_one_by_one
 class Eval:
     """Play fresh episodes with the policies of a run."""
 
-    directory: tyro.conf.Positional[Path]
-    """Directory of the run."""
+    directory: tyro.conf.Positional[str]
+    """Directory of the run, or policy:NAME for one that comes with the package (`hindrl policies` lists them)."""
     episodes: int = 100
     """Episodes per seed."""
     seed: int = 0
@@ -40,7 +41,7 @@ def evaluate(arguments: list[str]) -> None:
     options = parse(Eval, arguments, "hindrl eval")
     if options.episodes < 1:
         raise UserError(f"--episodes {options.episodes} is too few: play at least 1")
-    run = load_run(options.directory, last=options.last)
+    run = load_run(run_directory(options.directory), last=options.last)
     if options.backend is not None:
         run = run.in_backend(options.backend)
     columns = (TextColumn("{task.completed}/{task.total} episodes"), BarColumn(), TimeRemainingColumn())
@@ -64,10 +65,11 @@ def evaluate(arguments: list[str]) -> None:
 class Render:
     """Film episodes of a run's policy."""
 
-    directory: tyro.conf.Positional[Path]
-    """Directory of the run."""
+    directory: tyro.conf.Positional[str]
+    """Directory of the run, or policy:NAME for one that comes with the package (`hindrl policies` lists them)."""
     to: Path | None = None
-    """A .gif or .mp4 file, or a .png file for the last state (default: a .gif in DIRECTORY, named after episode and seed). For .mp4 install av."""
+    """A .gif or .mp4 file, or a .png file for the last state (default: a .gif in DIRECTORY, named after episode and seed; of
+    policy:NAME, here). For .mp4 install av."""
     seed: int | None = None
     """Whose policy: one of the run's seeds (default: the first)."""
     episode: int = 0
@@ -85,8 +87,10 @@ def render(arguments: list[str]) -> None:
     options = parse(Render, arguments, "hindrl render")
     if options.episodes < 1:
         raise UserError(f"--episodes {options.episodes} is too few: film at least 1")
-    run = load_run(options.directory, last=options.last)
-    path = options.to or options.directory / f"episode_{options.episode}_seed_{run.spec.seeds[0] if options.seed is None else options.seed}.gif"
+    run = load_run(run_directory(options.directory), last=options.last)
+    name = f"episode_{options.episode}_seed_{run.spec.seeds[0] if options.seed is None else options.seed}.gif"
+    ships = options.directory.startswith(PREFIX)  # and so its directory is the installation's
+    path = options.to or (Path(f"{options.directory.removeprefix(PREFIX)}_{name}") if ships else Path(options.directory) / name)
     keys = jnp.stack([episode_key(options.episode + number) for number in range(options.episodes)])
     solved = run.render(path, seed=options.seed, key=keys, noise=options.noise)
     single = f"the episode is {'solved' if solved else 'not solved'}"

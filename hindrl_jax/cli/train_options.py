@@ -13,11 +13,47 @@ import tyro
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.cli.common import ENV_HELP, env_names, parse, peek, seeds_from
 from hindrl_jax.config import TrainConfig, without_effect
-from hindrl_jax.demonstrations.convert import MINARI_PREFIX
+from hindrl_jax.demonstrations.convert import MINARI_PREFIX, open_source
 from hindrl_jax.runs.spec import FROM_PYTHON, RunSpec, read_spec
 from hindrl_jax.tasks.presets import Preset, original_rules, preset
 from hindrl_jax.tasks.registry import make, task
 from hindrl_jax.training.checks import check_config, check_trainable
+
+_FIRST_TASK = "FixedGridPickAndPlace"
+_BRIEF = {  # what --help shows
+    "what to train": {
+        "env NAME": "a task of `hindrl envs`, gymnasium:ID, or MODULE:NAME for your own; a file of --demos says its own",
+        "demos N|FILE": "how many demonstrations the task's expert records for each seed, or a file of them",
+        "algo NAME": "bc, tqcfd, hindrl or smooth-hindrl",
+        "preset NAME": "where the other defaults come from: default, thesis, original or rlpd",
+        "steps N": "environment steps of each seed (default: 50,000 decisions, at least 100,000 steps)",
+        "stop-at SHARE": "stop when this share of episodes is solved, for example 0.95",
+    },
+    "the run": {
+        "seeds N": "how many seeds are trained side by side (default: 1)",
+        "seed N": "the first of them (default: 0)",
+        "out DIR": "where the run is written (default: in runs/, named after task and time)",
+        "overwrite": "replace a run that is already there",
+        "resume DIR": "go on with a run that was stopped",
+        "config DIR": "run again what a run's config.json says; other flags change it",
+    },
+    "learning": {
+        "learning-rate X": "step size of Adam",
+        "batch-size N": "rows of a gradient step",
+        "net-arch N ...": "widths of the hidden layers",
+        "bc-weight X": "how much the demonstrated actions are imitated",
+        "relabelled-per-original X": "relabelled rows for each original one",
+        "action-hold N": "control steps for which each action is held (default: by the demonstrations' length)",
+    },
+}
+_EXAMPLES = {
+    "hindrl train": (
+        "hindrl train --env FixedParameterizedReach --demos 1 --seeds 4",
+        "hindrl train --demos demos.hdf5 --steps 100000 --out runs/mine",
+        "hindrl train --resume runs/mine",
+    ),
+    "hindrl sweep": ("hindrl sweep --over learning_rate=1e-4,3e-4,1e-3 --seeds 8",),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,7 +61,7 @@ class TrainOptions:
     """Options of `hindrl train` and `hindrl sweep` that belong to the run as a whole."""
 
     demos: str = "1"
-    """Demonstrations: a number to record with the task's expert for each seed, or a file (.hdf5, .npz) or minari:NAME-v0 that all seeds share."""
+    """How many demonstrations the task's expert records for each seed, or a file of them (.hdf5, .npz, or minari:NAME-v0) that all seeds share."""
     seeds: int | None = None
     """Number of seeds trained side by side (default: 1)."""
     seed: int | None = None
@@ -85,13 +121,18 @@ def parse_train(
     Raises:
       UserError: if something is not usable.
     """
-    chosen = {name: peek(arguments, name) for name in ("env", "algo", "preset", "config")}
+    chosen = {name: peek(arguments, name) for name in ("env", "algo", "preset", "config", "demos")}
     spec = _defaults(chosen)
     fields: list[tuple[str, Any, Any, str]] = [
         ("env", env_names(chosen["env"] or spec.env.name), spec.env.name, ENV_HELP),
-        ("preset", Preset, chosen["preset"] or "default", "Where the other defaults come from: our recipe, the thesis, its original code, or RLPD."),
+        (
+            "preset",
+            Preset,
+            chosen["preset"] or "default",
+            "Where the other defaults come from: this project, the thesis, its original code, or RLPD.",
+        ),
         ("config", Path | None, None, "Run again what a config.json (or the directory of a run) says; other flags change it."),
-        ("resume", Path | None, None, "Go on with the run, or sweep, of a directory that was stopped or killed, as if it had never been."),
+        ("resume", Path | None, None, "Go on with the run, or sweep, of a directory that was stopped or killed, as if it had not been stopped."),
         ("run", options_class, options_class(demos=spec.demos), ""),
         ("environment", type(spec.env), spec.env, ""),
         ("training", TrainConfig, spec.config, ""),  # last, since its quirks are what fewest people look for
@@ -101,7 +142,12 @@ def parse_train(
         [(name, Annotated[kind, tyro.conf.arg(help=text)] if text else kind, default) for name, kind, default, text in fields],
         frozen=True,
     )
-    parsed = parse(namespace, arguments, program, description)
+    chosen_flags = (
+        _BRIEF
+        if options_class is TrainOptions
+        else {"what to sweep": {"over NAME=X,Y": "an option and its values; given several times, all combinations"}, **_BRIEF}
+    )
+    parsed = parse(namespace, arguments, program, description, (chosen_flags, _EXAMPLES[program]))
     check_trainable(parsed.environment)
     check_config(parsed.environment, parsed.training)
     _warn_of_what_has_no_effect(spec.config, parsed.training)
@@ -118,10 +164,33 @@ def _defaults(chosen: dict[str, Any]) -> RunSpec:
             if chosen[name] is not None:
                 raise UserError(f"--{name} and --config exclude each other: the configuration file says it; drop one of them")
         return read_spec(Path(chosen["config"]))
-    name = chosen["env"] or "FixedGridPickAndPlace"
+    env_arguments: dict[str, Any] = {}
+    name = chosen["env"]
+    if name is None:
+        name, env_arguments = _task_of(chosen["demos"]) or (_FIRST_TASK, {})
     config = preset(chosen["algo"] or "hindrl", chosen["preset"] or "default", env=name)
-    env_arguments = original_rules(task(name).environment) if chosen["preset"] == "original" else {}
+    if chosen["preset"] == "original":
+        env_arguments = env_arguments | original_rules(task(name).environment)
     return RunSpec(env=make(name, **env_arguments), config=config, demos="1", seeds=(0,))
+
+
+def _task_of(demos: str | None) -> tuple[str, dict[str, Any]] | None:
+    """The name and the arguments of the task in which a file of demonstrations was recorded, as far as it can be trained in.
+
+    None where there is no such file or it does not say so. A damaged one is refused when its demonstrations are read.
+    """
+    if demos is None or is_number(demos) or not (demos.startswith(MINARI_PREFIX) or Path(demos).is_file()):
+        return None
+    try:
+        found = open_source(demos)
+        entry = task(found.env_name)
+        known = {field.name for field in dataclasses.fields(entry.environment)}
+    except UserError:
+        return None
+    given = {name: value for name, value in found.env_kwargs.items() if name in known}
+    if given.get("backend") == "robosuite":  # which records and evaluates, and does not train; its files fit the other back ends
+        del given["backend"]
+    return found.env_name, given
 
 
 def _seeds(options: TrainOptions, default: tuple[int, ...]) -> tuple[int, ...]:

@@ -6,15 +6,18 @@ import contextlib
 from typing import Any
 
 from rich import box
+from rich.console import Console
 from rich.table import Table
 
 from hindrl_jax.cli.common import console, peek
 from hindrl_jax.cli.hosts import joined_hosts
 from hindrl_jax.cli.running import check_unfinished, checkpoints_of, default_out, reporters_of, run, speed_line
-from hindrl_jax.cli.train_options import parse_resume, parse_train
+from hindrl_jax.cli.train_options import is_number, parse_resume, parse_train
 from hindrl_jax.config import TrainConfig
-from hindrl_jax.runs.spec import SUMMARY, read_spec
+from hindrl_jax.runs.spec import FROM_PYTHON, SUMMARY, RunSpec, read_spec
 from hindrl_jax.runs.writer import RunWriter
+
+_TABLE_WIDTH = 92  # at least: a column whose name is cut is hard to read
 
 
 def train(arguments: list[str]) -> None:
@@ -32,9 +35,12 @@ def train(arguments: list[str]) -> None:
         result = run(spec, [spec.config], writer if writes else None, checkpoints_of(out, options))
         if writes:
             summary = writer.finish(result)
-            console.print(_summary_table(summary, spec.config))
+            width = max(console.width, _TABLE_WIDTH)
+            Console(highlight=False, soft_wrap=True, markup=False, emoji=False, width=width).print(_summary_table(summary, spec.config))
             console.print(speed_line(summary))
             console.print(f"wrote {out}: {', '.join(writer.files())}")
+            if not any(seed["best_success"] or seed["returned_success"] for seed in summary["seeds"]):
+                console.print(nothing_solved(writer.spec))
 
 
 def _summary_table(summary: dict[str, Any], config: TrainConfig) -> Table:
@@ -57,3 +63,19 @@ def _summary_table(summary: dict[str, Any], config: TrainConfig) -> Table:
             cells.append(f"{seed['seconds_to_95']:.1f}")
         table.add_row(*cells)
     return table
+
+
+def nothing_solved(spec: RunSpec) -> str:
+    """What to try, in order, after a run whose policies solved nothing."""
+    few = is_number(spec.demos) and int(spec.demos) < 10
+    lines = ["no episode was solved. What to try, in this order:"]
+    file = "FILE" if is_number(spec.demos) or spec.demos == FROM_PYTHON else spec.demos
+    lines.append(f"`hindrl demos info {file}`: the demonstrations are solved, and epsilon is above 0 where the goal is continuous (--epsilon-steps)")
+    if spec.config.algo != "bc":
+        lines.append("`--algo bc` with many demonstrations: where it solves nothing either, the observation lacks what the expert acts on")
+    lines.append(f"a longer run: --steps {2 * spec.config.num_steps}; and other seeds: --seeds 4")
+    if few:
+        lines.append(f"more demonstrations: --demos {10 * int(spec.demos)}")
+    if spec.config.algo != "bc" and not spec.config.demo_reset_ratio:
+        lines.append("begin half of the training episodes in demonstrated states: --demo-reset-ratio 0.5")
+    return "\n".join([lines[0], *(f"  {number}. {line}" for number, line in enumerate(lines[1:], 1))])

@@ -51,7 +51,7 @@ class TrainConfig:
     """Gradient steps of behaviour cloning that make a second policy, frozen, which proposes an action beside the actor's: whichever the target
     critics value more is taken, in episodes, evaluations and targets (IBRL, Hu et al., 2024). 0 for no such policy."""
     agent_resets: tuple[float, ...] = ()
-    """Shares of the run, in order, after which networks, optimisers and their schedules begin anew, while the replay stays (Nikishin et al., The
+    """Shares of the run, in order, after which networks, optimisers and their schedules are reset, while the replay stays (Nikishin et al., The
     primacy bias in deep reinforcement learning, 2022)."""
     buffer_size: int = 500_000
     """Transitions that the replay holds."""
@@ -105,7 +105,7 @@ class TrainConfig:
 
     @property
     def num_held(self) -> int:
-        """Control steps for which each action is held; 1 where nobody has chosen."""
+        """Control steps for which each action is held; 1 where none is set."""
         return self.action_hold or 1
 
     @property

@@ -2,5 +2,5 @@
 
 All modules are public. Data: `goals`, `hindsight` (sources of goals), `replay`, `steps`, `relabel`, `batch`. Learning: `networks`, `inputs`, `losses`
 over `kernels`, `comparison` (of actions), `agent`. Both together: `rollout`, `guidance` (what demonstrations give), `holding` (actions for several
-steps), `schedules`, `randomness`, and `train`, whose functions the room `training` compiles.
+steps), `schedules`, `randomness`, and `train`, whose functions the package `training` compiles.
 """

@@ -39,7 +39,7 @@ class TrainState(struct.PyTreeNode, kw_only=True):
     key: Array
     env_steps: Array  # () int32
     updates: Array  # () int32
-    resets: Array  # () int32 times that the agent began anew
+    resets: Array  # () int32 times that the agent was reset
     updates_at_reset: Array  # () int32 updates when it last did, or 0
 
 
@@ -113,7 +113,7 @@ def _agent_schedule(state: TrainState, updates: Array, env: Environment, config:
 
 
 def _reset_agent_if_due(state: TrainState, env: Environment, config: TrainConfig) -> TrainState:
-    """The agent begins anew, and all else stays, at the first call after each share of the run in `agent_resets`."""
+    """The agent is reset, and all else stays, at the first call after each share of the run in `agent_resets`."""
     if not config.agent_resets:
         return state
     passed = jnp.sum(_progress(state, config) >= jnp.asarray(config.agent_resets))

@@ -53,7 +53,9 @@ def save_sweep(parts: Sequence[Result], labels: Sequence[str], path: Path) -> No
         mark_success(axis)
 
 
-def save_filter(achieved_goals: np.ndarray, kept: np.ndarray, epsilon: np.ndarray, path: Path, *, dims: tuple[int, int], title: str) -> None:
+def save_filter(
+    achieved_goals: np.ndarray, kept: np.ndarray, epsilon: np.ndarray, path: Path, *, dims: tuple[int, int], labels: Sequence[str], title: str
+) -> None:
     """Draws what the epsilon filter does to one demonstration, as in thesis figures 4.1 and 4.2, as a PNG.
 
     On the left all goals that it reached, on the right those that are kept, with their boxes of half-width epsilon.
@@ -64,6 +66,7 @@ def save_filter(achieved_goals: np.ndarray, kept: np.ndarray, epsilon: np.ndarra
       epsilon: (G,) half-width of the goal box.
       path: the file.
       dims: the two goal dimensions to draw.
+      labels: their names.
       title: what the demonstration is.
     """
     x, y = (achieved_goals[:, dim] for dim in dims)
@@ -73,7 +76,7 @@ def save_filter(achieved_goals: np.ndarray, kept: np.ndarray, epsilon: np.ndarra
             axis.plot(x, y, color="0.75", linewidth=1, linestyle="--", zorder=1)
             axis.scatter(x[shown], y[shown], s=14, c=np.flatnonzero(shown), cmap="viridis", zorder=3)
             axis.set_title(f"{label}: {shown.sum()}", loc="left")
-            axis.set(xlabel=f"goal dimension {dims[0]}", ylabel=f"goal dimension {dims[1]}")
+            axis.set(xlabel=labels[0], ylabel=labels[1])
         box = dict(facecolor=SEED, edgecolor=MEAN, alpha=0.25, linewidth=0.5, zorder=2)
         for left, bottom in zip(x[kept] - width / 2, y[kept] - height / 2, strict=True):
             axes[1].add_patch(pyplot().Rectangle((left, bottom), width, height, **box))
@@ -88,7 +91,7 @@ def _curves(result: Result) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _mark_events(axis: Any, result: Result) -> None:
-    """Where the agent began anew, and the policies that are returned."""
+    """Where the agent was reset, and the policies that are returned."""
     for share in result.config.agent_resets:
         axis.axvline(share * result.config.num_steps, color="0.7", linestyle=":", linewidth=1)
     if result.returned is not None:

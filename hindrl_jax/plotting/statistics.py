@@ -28,7 +28,7 @@ class Interval:
 def bootstrap(values: Sequence[float] | np.ndarray, statistic: Callable[..., np.ndarray] = np.mean) -> Interval:
     """A statistic of independent values, and its 95% interval by the percentile bootstrap (Efron 1979).
 
-      The values are drawn anew, with replacement, 10,000 times; the interval reaches from the 2.5% to the 97.5% quantile of the statistic of these
+      The values are drawn again, with replacement, 10,000 times; the interval reaches from the 2.5% to the 97.5% quantile of the statistic of these
     draws. Quantiles are values that did occur, never something between two of them, so infinite values are allowed. With few values the interval is
     somewhat too narrow: of 16 normally distributed ones, it holds the true mean in 92% of all cases. Equal values give equal intervals.
 
@@ -73,7 +73,7 @@ def bootstrap_band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _mean_draws(values: np.ndarray, *, seed: int = 0) -> np.ndarray:
-    """(RESAMPLES, E) means of (E, S) values over seeds drawn anew; the same draws for all points."""
+    """(RESAMPLES, E) means of (E, S) values over resampled seeds; the same draws for all points."""
     num_seeds = values.shape[1]
     if num_seeds < 2:
         raise ValueError(f"{num_seeds} value has no bootstrap interval: give at least 2")

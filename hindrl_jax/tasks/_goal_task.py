@@ -131,7 +131,7 @@ def vector_programs(env: Any, continuing_task: bool, max_episode_steps: int, mod
         return tree_where(chosen, start(jnp.where(is_new, seeds, running.seeds), jnp.where(is_new, 0, running.episodes + 1)), running)
 
     def step(running: Running, actions: Array) -> tuple[Running, Array]:
-        """The environments after the step, and the rows before any of them began anew at its end."""
+        """The environments after the step, and the rows before any of them was reset at its end."""
         states, rows = jax.vmap(functools.partial(_step, env, continuing_task))(running.states, actions)
         steps = running.steps + 1
         rows = rows.at[:, -1].set(steps >= max_episode_steps)  # also where the step solves the task, as Gymnasium's own limit has it

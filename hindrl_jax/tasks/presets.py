@@ -15,7 +15,7 @@ The default is `TrainConfig()`, whatever the task is called. What differs betwee
                            demonstrations (thesis algorithm 5)
     relabelling            where episodes have goals of their own, or parameters of the task in their observations, half of the replay rows, with
                            goals of demonstrations and rollouts; where all aim at the same, a fifth, with goals of demonstrations: there, other
-                           goals are not what is to be learnt, and take room in the batch
+                           goals are not what is to be learnt, and take rows of the batch
     target entropy         counts per action dimension
     random steps           one horizon in each environment
 

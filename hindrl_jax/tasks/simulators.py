@@ -141,7 +141,7 @@ class Simulators:
         """The present observation of the first environment as it gives it."""
         return {key: values[0] for key, values in self._observed.items()}
 
-    def step(self, actions: np.ndarray, *, begin_anew: bool = True) -> Outcome:
+    def step(self, actions: np.ndarray, *, autoreset: bool = True) -> Outcome:
         """Takes one step of each: actions (N, A) in the environment's own units. Episodes that end give way to new ones, if they are to."""
         space = self._envs.single_action_space
         actions = np.clip(actions, space.low, space.high).astype(space.dtype)
@@ -151,7 +151,7 @@ class Simulators:
         success = rewards >= what.success_reward if what.success_key is None else np.asarray(info[what.success_key], np.float32) > 0.5
         terminated = terminated | success
         ended = terminated | truncated
-        if begin_anew and ended.any():
+        if autoreset and ended.any():
             self._observed, _ = self._envs.reset(options={"reset_mask": ended})
         observation, desired_goal = self.now()
         return Outcome(

@@ -55,7 +55,7 @@ def fit(
       seeds: non-negative integers. A seed gives the same run whatever the others are, up to floating-point rounding. But an `action_hold` of None is
         chosen by the demonstrations of all of them, and with `stop_at` they all learn on until the last of them is done.
       report: called after compilation, several times between evaluations, after each evaluation, and at the end. Where it returns True
-        while the experiment learns, that ends: what was found so far is returned as ever.
+        while the experiment learns, that ends: what was found so far is returned as usual.
       restore: called before anything is computed with a result whose guidance, state and key are `jax.ShapeDtypeStruct`s. Where it returns
         what `report` was given at some time in an earlier call with the same arguments, the experiment goes on from there, and all that
         follows is the same, bit for bit; see `hindrl_jax.runs.checkpoints`. Where it returns None, the experiment begins. In environments that

@@ -142,7 +142,7 @@ def film(stepper: WatchedStepper, seed: int, act: HostAct, behavioural_goal: np.
     while True:
         action = act(observation, behavioural_goal if goal is None else goal)
         for _ in range(num_held):
-            outcome = stepper.step(action, begin_anew=False)
+            outcome = stepper.step(action, autoreset=False)
             pictures.append(stepper.picture())
             if outcome.ended[0]:
                 return pictures, bool(outcome.success[0])

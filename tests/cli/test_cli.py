@@ -1,5 +1,6 @@
 """The command line as a whole: interrupts, refusals, and what it lists."""
 
+import shlex
 import signal
 import subprocess
 import sys
@@ -8,7 +9,7 @@ import time
 import pytest
 from commands import refusal
 
-from hindrl_jax import cli
+from hindrl_jax import __version__, cli
 from hindrl_jax.tasks.registry import TASKS
 
 
@@ -48,12 +49,19 @@ def test_an_interrupt_does_not_outlive_its_command(monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "needs a command"),
+        (["demos"], "'hindrl demos' needs a command"),
         (["trian"], "did you mean 'train'?"),
         (["train", "--env", "FixedGrid"], "unknown environment 'FixedGrid' (did you mean"),
         (["train", "--algo", "sac"], "unknown algorithm 'sac'"),
         (["train", "--preset", "paper"], "unknown preset 'paper'"),
         (["train", "--lerning-rate", "1"], "did you mean --learning-rate?"),
+        (["train", "--lr", "1"], "did you mean --learning-rate?"),
+        (["train", "--lr=1"], "did you mean --learning-rate?"),
+        (["train", "--total_timesteps", "1"], "did you mean --steps?"),
+        (["train", "--n-envs", "1"], "did you mean --num-envs?"),
+        (["train", "--resets", "1"], "did you mean --agent-resets?"),
+        (["eval"], "hindrl eval needs DIRECTORY"),
+        (["demos", "record", "--out", "x.hdf5"], "hindrl demos record needs --demos INT"),
         (["train", "--learning-rate", "fast"], "fast"),
         (["train", "--learning-rate", "nan"], "learning_rate = nan"),
         (["train", "--gamma", "1.5"], "gamma = 1.5"),
@@ -88,6 +96,37 @@ def test_envs_lists_every_environment(capsys):
     printed = capsys.readouterr().out
     assert all(name in printed for name in TASKS)
     assert "\ngymnasium:ID: " in printed  # rich would make a picture of :ID:
+
+
+def test_without_arguments_it_says_what_there_is(capsys):
+    cli.main([])
+    printed = capsys.readouterr().out
+    assert "hindrl train" in printed
+    assert "hindrl demos record" in printed
+    assert "hindrl COMMAND --help" in printed
+
+
+def test_it_says_its_version(capsys):
+    cli.main(["--version"])
+    assert capsys.readouterr().out.startswith(f"hindrl_jax {__version__}, jax ")
+
+
+def completions(script, line):
+    """What bash offers at the end of a line."""
+    words = line.split(" ")
+    asked = f"COMP_WORDS=({' '.join(map(shlex.quote, words))}); COMP_CWORD={len(words) - 1}; _hindrl; printf '%s\\n' \"${{COMPREPLY[@]}}\""
+    return subprocess.run(["bash", "-c", f"{script}\n{asked}"], capture_output=True, text=True, check=True).stdout.split()
+
+
+def test_the_shell_completes(capsys):
+    cli.main(["completion"])
+    script = capsys.readouterr().out
+    assert completions(script, "hindrl tr") == ["train"]
+    assert completions(script, "hindrl demos re") == ["record", "render"]
+    assert completions(script, "hindrl train --env Fixed") == ["FixedGridPickAndPlace", "FixedParameterizedReach"]
+    assert completions(script, "hindrl train --learning-r") == ["--learning-rate"]
+    assert completions(script, "hindrl train --seeds 3 --algo sm") == ["smooth-hindrl"]
+    assert completions(script, "hindrl demos record --ou") == ["--out"]
 
 
 def test_the_installed_command_starts():

@@ -1,16 +1,20 @@
 """`hindrl demos ...`, and how training takes files of demonstrations."""
 
+import dataclasses
 import re
 
 import h5py
+import jax
 import numpy as np
 import pytest
 from commands import refusal
 from PIL import Image
 
 from hindrl_jax import cli
+from hindrl_jax.cli.dimension_names import dimension_names
 from hindrl_jax.cli.running import demonstrations_of
 from hindrl_jax.cli.train_options import parse_train
+from hindrl_jax.tasks.registry import TASKS, make
 
 
 def test_drawing_into_nowhere_is_refused(run, demos_file, tmp_path, capsys):
@@ -83,3 +87,32 @@ def test_demos_info_and_render(demos_file, tmp_path, capsys):
     cli.main(["demos", "render", str(demos_file), "--demo", "1", "--to", str(tmp_path / "demo.png")])
     assert (tmp_path / "demo.png").read_bytes().startswith(b"\x89PNG")
     assert "no demonstration 2" in refusal(capsys, "demos", "render", demos_file, "--demo", 2)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_dimensions_have_names(name):
+    env = make(name)
+    names = dimension_names(env)
+    assert list(map(len, dataclasses.astuple(names))) == [env.observation_dim, env.goal_dim, env.action_dim]
+    assert all(len(set(one)) == len(one) for one in dataclasses.astuple(names))
+
+
+def test_names_follow_the_options_of_the_task():
+    assert dimension_names(make("FixedParameterizedReach", num_waypoints=3, orientation="axis_angle")).goal[-4:] == (
+        "hand's orientation 3",
+        "waypoint 1 reached",
+        "waypoint 2 reached",
+        "waypoint 3 reached",
+    )
+    env = make("GridPickAndPlace", num_objects=3)
+    observation = env.observe(env.reset(jax.random.key(0))[0].replace(num_delivered=2))
+    named = dict(zip(dimension_names(env).observation, observation.tolist(), strict=True))
+    assert [named[f"object {number} delivered"] for number in range(3)] == [1, 1, 0]
+    assert len(dimension_names(make("CableInsertion", observation="thesis")).observation) == 31
+
+
+def test_demos_info_names_dimensions(demos_file, capsys):
+    cli.main(["demos", "info", str(demos_file)])
+    printed = capsys.readouterr().out
+    assert "object 1 from agent, x" in printed
+    assert "move +x" in printed

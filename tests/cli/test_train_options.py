@@ -50,7 +50,7 @@ def test_commands_of_the_readme_parse(command, run):
 
 def test_every_config_field_is_a_flag(capsys):
     with pytest.raises(SystemExit):
-        cli.main(["train", "--help"])
+        cli.main(["train", "--help-all"])
     printed = capsys.readouterr().out
     config = preset()
     sections = [section for section in vars(config).values() if dataclasses.is_dataclass(section)]
@@ -60,11 +60,60 @@ def test_every_config_field_is_a_flag(capsys):
             assert dataclasses.is_dataclass(getattr(part, field.name)) or f"--{field.name.replace('_', '-')}" in printed, field.name
 
 
-def test_quirks_come_last_in_the_help(capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")  # one column
+def test_quirks_come_last_in_the_help(capsys):
     with pytest.raises(SystemExit):
-        cli.main(["train", "--help"])
-    assert re.findall(r"(training\.\w+) options", capsys.readouterr().out)[-2:] == ["training.agent", "training.quirks"]
+        cli.main(["train", "--help-all"])
+    titles = re.findall(r"^(\S.*):$", capsys.readouterr().out, re.MULTILINE)
+    assert titles == [
+        "options",
+        "the task",
+        "training",
+        "training: the batch",
+        "training: goals",
+        "training: networks and losses",
+        "training: peculiarities of the thesis and its code",
+    ]
+
+
+def test_the_short_help_is_short_and_names_no_flag_that_is_not_there(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    pages = []
+    for flag in ("--help", "--help-all"):
+        with pytest.raises(SystemExit) as stop:
+            cli.main(["train", flag, "--env", "FixedParameterizedReach", "--algo", "bc"])
+        assert stop.value.code == 0
+        pages.append(capsys.readouterr().out)
+    short, full = pages
+    assert len(short.splitlines()) < 60
+    assert max(map(len, short.splitlines())) < 80
+    assert set(re.findall(r"--[a-z-]+", short)) - {"--help-all"} <= set(re.findall(r"--[a-z-]+", full))
+    assert "--num-waypoints" in short  # of the task that is named
+    assert "(default: FixedParameterizedReach)" in " ".join(short.split())
+
+
+def test_each_default_is_said_once(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit):
+        cli.main(["train", "--help-all"])
+    printed = capsys.readouterr().out
+    assert "(default: None)" not in printed
+    assert "{None}" not in printed
+    assert all(line.count("(default: ") <= 1 for line in printed.splitlines())
+    assert "Learning rate" not in printed
+    assert "      Discount factor. (default: 0.98)" in printed.splitlines()
+
+
+def test_a_file_of_demonstrations_says_which_task(tmp_path):
+    file = tmp_path / "demos.hdf5"
+    cli.main(["demos", "record", "--env", "GridPickAndPlace", "--num-objects", "1", "--demos", "1", "--out", str(file)])
+    spec, _ = parse_train(["--demos", str(file)])
+    assert spec.env == make("GridPickAndPlace", num_objects=1)
+    assert spec.config == preset(env="GridPickAndPlace")
+    spec, _ = parse_train(["--demos", str(file), "--horizon", "50"])  # other flags change it
+    assert spec.env == make("GridPickAndPlace", num_objects=1, horizon=50)
+    spec, _ = parse_train(["--demos", str(file), "--env", "FixedGridPickAndPlace"])  # and the flag wins
+    assert spec.env == make("FixedGridPickAndPlace")
+    assert parse_train(["--demos", "3"])[0].env.name == "FixedGridPickAndPlace"
 
 
 def test_flags_of_each_type():

@@ -14,9 +14,13 @@ from toy_env import Corridor, corridor_demonstrations
 
 import hindrl_jax as hindrl
 from hindrl_jax import cli
+from hindrl_jax.cli.policies import shipped
 from hindrl_jax.cli.train_options import parse_train
+from hindrl_jax.cli.training import nothing_solved
 from hindrl_jax.runs.reader import load_run
+from hindrl_jax.runs.spec import RunSpec
 from hindrl_jax.tasks import registry
+from hindrl_jax.tasks.presets import preset
 
 SEED_FIELDS = {"seed", "final_success", "env_steps_to_95", "updates_to_95", "seconds_to_95", "episode_length", "evaluation_steps"}
 SEED_FIELDS |= {f"returned_{what}" for what in ("success", "length", "noise", "env_steps", "updates", "seconds")}
@@ -48,6 +52,20 @@ def test_run_directory_holds_what_it_promises(run):
     assert all(np.isfinite(float(value)) for row in rows for value in row.values())
     with np.load(run / "parameters.npz", allow_pickle=False) as archive:
         assert archive["policy/params/Dense_0/kernel"].shape == archive["last_policy/params/Dense_0/kernel"].shape == (2, 40, 8)
+
+
+def test_a_run_that_solves_nothing_says_what_to_try():
+    config = preset("hindrl")
+    spec = RunSpec(env=hindrl.make("FixedGridPickAndPlace"), config=config, demos="1", seeds=(0,))
+    lines = nothing_solved(spec).splitlines()
+    assert [line.split(".")[0].strip() for line in lines[1:]] == ["1", "2", "3", "4", "5"]
+    assert "hindrl demos info" in lines[1]
+    assert "--steps 200000" in lines[3]
+    assert "--demos 10" in lines[4]
+    of_file = nothing_solved(dataclasses.replace(spec, demos="mine.hdf5", config=preset("bc")))
+    assert "hindrl demos info mine.hdf5" in of_file
+    assert "--algo bc" not in of_file
+    assert "--demo-reset-ratio" not in of_file
 
 
 def test_config_runs_again_and_other_flags_change_it(run, tmp_path):
@@ -214,3 +232,26 @@ def test_existing_run_is_refused_and_kept(run, capsys):
     refusal(capsys, "train", "--out", run, "--overwrite", "--demos", "missing.hdf5", *TINY)
     refusal(capsys, "train", "--out", run, "--overwrite", "--buffer-size", "100")
     assert {file.name: file.read_bytes() for file in run.iterdir()} == before
+
+
+def test_policies_that_ship_are_listed_and_small(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    cli.main(["policies"])
+    printed = capsys.readouterr().out
+    assert {"FixedGridPickAndPlace", "FixedParameterizedReach"} <= set(shipped())
+    for name, path in shipped().items():
+        assert f" {name} " in printed
+        assert sum(file.stat().st_size for file in path.iterdir()) < 1_000_000
+        assert load_run(path).spec.env.name == name
+    cli.main(["eval", "policy:FixedGridPickAndPlace", "--episodes", "20"])
+    assert " 2      100.0%" in capsys.readouterr().out
+    cli.main(["render", "policy:FixedGridPickAndPlace"])
+    assert (tmp_path / "FixedGridPickAndPlace_episode_0_seed_2.gif").stat().st_size > 0
+    assert "did you mean 'FixedParameterizedReach'?" in refusal(capsys, "render", "policy:ParameterizedReach")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", shipped())
+def test_policies_that_ship_solve_their_tasks(name):
+    (outcome,) = load_run(shipped()[name]).evaluate(episodes=100)
+    assert outcome["success"] >= (0.75 if name == "BringNear" else 0.98)

@@ -2,7 +2,7 @@
 
 They say that the algorithm is the same as before, not that it is right: a change that is meant to change it records them again, which the
 function `record` does (`python tests/core/test_golden.py`), and says so. The file was first made by the code as it was before it was taken
-apart into rooms.
+apart into packages.
 
 Numbers are compared to a thousandth, or to 1e-5 where they are near 0. Another processor, or other work of the compiler, adds in another order,
 and what that changes grows along a run. Here it stays below a third of what is allowed, from the instructions of 2008 to those of today and

@@ -79,7 +79,7 @@ def test_guidance_reads_no_padding():
         (dict(epsilon_filtering=True, epsilon=1.0), dict(), [0.0, 3.0, 4.0]),
         (dict(epsilon_filtering=True, epsilon=1.0), dict(strict_goal_test=True), [0.0, 1.0, 3.0, 4.0, 5.0]),
         (dict(epsilon_filtering=True, epsilon=1.0), dict(exclude_last_goal=True), [0.0, 4.0]),
-        (dict(epsilon_filtering=True, epsilon=1.5), dict(), [0.0, 3.0, 4.0]),  # the filter starts anew in every demonstration: 4 is near 3 and stays
+        (dict(epsilon_filtering=True, epsilon=1.5), dict(), [0.0, 3.0, 4.0]),  # the filter starts again in every demonstration: 4 is near 3 and stays
     ],
 )
 def test_goals_that_are_kept_by_hand(goal, quirks, expected):

@@ -64,7 +64,7 @@ def test_auto_reset_keeps_the_true_next_observation_and_starts_a_fresh_episode(p
     np.testing.assert_array_equal(states.env_state.start, states.observation[..., 0])
 
 
-def test_goal_is_kept_within_an_episode_and_drawn_anew_after_it(played):
+def test_goal_is_kept_within_an_episode_and_drawn_again_after_it(played):
     start, states, time_steps = played
     before = np.concatenate([start.desired_goal[None], states.desired_goal[:-1]])
     over = np.asarray(time_steps.terminated | time_steps.truncated)

@@ -272,7 +272,7 @@ def test_with_span_1_the_averaged_actor_is_the_mean_of_all_actors(data):
     assert np.abs(mean["params"]["Dense_0"]["kernel"] - actors[3]["params"]["Dense_0"]["kernel"]).max() > 1e-4
 
 
-def test_the_agent_begins_anew_once_and_the_replay_stays(data):
+def test_the_agent_is_reset_once_and_the_replay_stays(data):
     """A reset halfway, at step 51: collecting takes 42 steps, each call of `learn` 9 more and 6 updates."""
     config = make_config(agent_resets=(0.5,))
     run = jax.jit(functools.partial(train.learn, env=make_env(), config=config, num_iterations=LEARN_STEPS))

@@ -98,7 +98,7 @@ def touches(data, name):
 
 
 def test_a_head_is_held_where_both_pads_touch_its_grip():
-    """As told from geometry alone, which JAX knows without MuJoCo's contacts."""
+    """As geometry alone says, which JAX knows without MuJoCo's contacts."""
     states = episode()
     found, expected = [], []
     for t in range(0, 460, 5):

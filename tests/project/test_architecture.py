@@ -1,4 +1,4 @@
-"""The arrows between rooms: what each may import. Read off the source, so that an import inside a function counts too."""
+"""The arrows between packages: what each may import. Read off the source, so that an import inside a function counts too."""
 
 import ast
 import graphlib
@@ -8,8 +8,8 @@ import pytest
 
 ROOT = Path(__file__).parent.parent.parent
 
-# From the ground up. A room uses only what stands on lower floors, never its neighbours.
-FLOORS = (
+# From the ground up. A package uses only lower layers, never its neighbours.
+LAYERS = (
     {"base"},
     {"config", "envs"},
     {"core", "experts"},
@@ -20,15 +20,15 @@ FLOORS = (
     {"reporting", "reproduction"},
     {"cli"},
 )
-FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
+LAYER = {package: layer for layer, packages in enumerate(LAYERS) for package in packages}
 FACADE = {"hindrl_jax", "hindrl_jax.__main__"}  # what the package shows, and `python -m hindrl_jax`
 
-# Packages that a room may import, where not every one is allowed.
+# Packages that a package may import, where not every one is allowed.
 STANDARD_LIBRARY = {"__future__", "abc", "collections", "copy", "dataclasses", "enum", "functools", "itertools", "math", "types", "typing"}
 PURE = STANDARD_LIBRARY | {"jax", "flax", "optax", "chex"}
 DRAWING = {"viewer", "drawing", "renderer", "meshes", "opengl"}  # modules of envs that dynamics never import
 SCREEN = {"PIL", "os"}  # what all of them may import
-# What single modules may import beyond the others of their room. robosuite is found and silenced in one module; a person plays in real time.
+# What single modules may import beyond the others of their package. robosuite is found and silenced in one module; a person plays in real time.
 BEYOND = {
     "robot": {"mujoco", "pathlib"},  # to read the model's file
     "mjx_dynamics": {"mujoco", "contextlib", "io"},
@@ -90,23 +90,23 @@ def used_packages(path):
     return {name.partition(".")[0] for name in imports(path)} - {"hindrl_jax"}
 
 
-def room_of(module):
+def package_of(module):
     return module.split(".")[1]
 
 
-ROOMS = {module: path for module, path in SOURCES.items() if module not in FACADE}
+MODULES = {module: path for module, path in SOURCES.items() if module not in FACADE}
 ARROWS = {module: used_modules(path) - {module} for module, path in SOURCES.items()}
 
 
-def test_every_module_is_in_a_room():
-    assert {room_of(module) for module in ROOMS} == set(FLOOR)
+def test_every_module_is_in_a_package():
+    assert {package_of(module) for module in MODULES} == set(LAYER)
 
 
-@pytest.mark.parametrize("module", ROOMS)
-def test_module_uses_only_lower_floors(module):
-    own = room_of(module)
-    others = {used for used in ARROWS[module] - FACADE if room_of(used) != own}
-    assert [used for used in sorted(others) if FLOOR[room_of(used)] >= FLOOR[own]] == []
+@pytest.mark.parametrize("module", MODULES)
+def test_module_uses_only_lower_layers(module):
+    own = package_of(module)
+    others = {used for used in ARROWS[module] - FACADE if package_of(used) != own}
+    assert [used for used in sorted(others) if LAYER[package_of(used)] >= LAYER[own]] == []
 
 
 def test_no_circles():
@@ -119,26 +119,28 @@ def test_a_circle_is_found():
         graphlib.TopologicalSorter({"a": {"b"}, "b": {"a"}}).prepare()
 
 
-@pytest.mark.parametrize("module", [module for module in ROOMS if room_of(module) in ("core", "config")])
+@pytest.mark.parametrize("module", [module for module in MODULES if package_of(module) in ("core", "config")])
 def test_core_and_config_are_pure(module):
     """No disk, no printing, no NumPy."""
     assert used_packages(SOURCES[module]) <= PURE
     assert called_names(SOURCES[module]) & {"print", "open", "input", "__import__", "exec", "eval"} == set()
 
 
-@pytest.mark.parametrize("module", [module for module in ROOMS if room_of(module) == "core"])
+@pytest.mark.parametrize("module", [module for module in MODULES if package_of(module) == "core"])
 def test_core_knows_no_environment_and_no_file(module):
-    assert {room_of(used) for used in ARROWS[module]} <= {"base", "config", "core"}
-    assert {used for used in ARROWS[module] if room_of(used) == "base"} <= {f"hindrl_jax.base.{name}" for name in ("types", "environments", "errors")}
+    assert {package_of(used) for used in ARROWS[module]} <= {"base", "config", "core"}
+    assert {used for used in ARROWS[module] if package_of(used) == "base"} <= {
+        f"hindrl_jax.base.{name}" for name in ("types", "environments", "errors")
+    }
 
 
-@pytest.mark.parametrize("module", [module for module in ROOMS if room_of(module) in ("envs", "experts")])
+@pytest.mark.parametrize("module", [module for module in MODULES if package_of(module) in ("envs", "experts")])
 def test_environments_and_experts_import_little(module):
     name = module.rpartition(".")[2]
-    draws = room_of(module) == "envs" and name in DRAWING
+    draws = package_of(module) == "envs" and name in DRAWING
     allowed = PURE | {"numpy"} | BEYOND.get(name, set()) | (SCREEN if draws else set())
     assert used_packages(SOURCES[module]) <= allowed
-    if not draws and room_of(module) == "envs":
+    if not draws and package_of(module) == "envs":
         assert not any(used.rpartition(".")[2] in DRAWING for used in ARROWS[module])
 
 
@@ -167,7 +169,7 @@ def test_no_file_is_long():
     assert {module: length for module, path in SOURCES.items() if (length := len(path.read_text().splitlines())) > 350} == {}
 
 
-@pytest.mark.parametrize("module", [module for module in ROOMS if room_of(module) == "core"])
+@pytest.mark.parametrize("module", [module for module in MODULES if package_of(module) == "core"])
 def test_functions_of_the_core_take_few_parameters(module):
     functions = [node for node in ast.walk(ast.parse(SOURCES[module].read_text())) if isinstance(node, ast.FunctionDef)]
     assert [function.name for function in functions if num_parameters(function) > 6] == []
@@ -178,9 +180,9 @@ def num_parameters(function):
     return len([name for name in names if name not in ("self", "cls")])
 
 
-def test_every_room_says_what_it_is_for():
-    for room in FLOOR:
-        assert len(ast.get_docstring(ast.parse(SOURCES[f"hindrl_jax.{room}"].read_text())).split()) > 8
+def test_every_package_says_what_it_is_for():
+    for package in LAYER:
+        assert len(ast.get_docstring(ast.parse(SOURCES[f"hindrl_jax.{package}"].read_text())).split()) > 8
 
 
 def test_imports_outside_functions_are_found(tmp_path):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import glob
+import importlib.util
 import os
 import re
 import shutil
@@ -43,10 +44,48 @@ def site(tmp_path_factory):
 def test_site_builds_without_a_warning(site):
     core = (site / "site" / "api" / "core.html").read_text()
     assert "Half-width of the goal box per dimension (thesis eq. 4.7)" in core
-    assert "(B,), factor of the bootstrapped value" in core  # a shape comment behind a field of Transition
+    base = (site / "site" / "api" / "base.html").read_text()
+    assert "(B,), factor of the bootstrapped value" in base  # a shape comment behind a field of Transition
     commands = (site / "site" / "generated" / "command-line.html").read_text()
     assert "--hindrl-sampling-strategy" in commands
     assert "\x1b" not in commands
+
+
+@pytest.fixture(scope="module")
+def checker():
+    """docs/check_site.py as a module."""
+    spec = importlib.util.spec_from_file_location("check_site", ROOT / "docs" / "check_site.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["check_site"] = module
+    spec.loader.exec_module(module)
+    if module.find_browser() is None:
+        pytest.skip("no browser is installed")
+    return module
+
+
+def test_site_in_a_browser(site, checker):
+    report = checker.check(site / "site", checker.find_browser())
+    assert report.pages > 30
+    assert report.is_good(), "\n".join(report.lines())
+
+
+def test_the_browser_check_finds_what_is_wrong(checker, tmp_path):
+    (tmp_path / "index.html").write_text(
+        """<body><div class="md-content"><p style="width: 2000px">wide</p>
+        <pre style="overflow: auto; width: 90px"><code>a long line of code</code></pre>
+        <img src="nowhere.png"><a href="nowhere.html">nowhere</a><a href="#nowhere">nowhere</a><a href="#here" id="here">here</a></div>
+        <input class="md-search__input"><input type="checkbox" id="__search"><script>console.error("trouble")</script></body>"""
+    )
+    report = checker.check(tmp_path, checker.find_browser(), patience=0.5)
+    assert [one.rpartition("page: ")[2] for one in report.overflowing] == [
+        "p: wide",
+        "index.html, laptop: has to be scrolled: pre: a long line of code",
+        "p: wide",
+    ]
+    assert [one.rpartition("/")[2] for one in report.dead_links] == ["index.html#nowhere", "nowhere.html"]
+    assert report.missing_pictures == ["index.html: nowhere.png"] * 2
+    assert any("trouble" in one for one in report.console_errors)
+    assert not report.is_good()
 
 
 def test_flags_exist(site):
@@ -56,7 +95,7 @@ def test_flags_exist(site):
     others = {"--ntasks-per-node", "--gpus-per-node"}  # SLURM's
     others |= {"--gate-width", "--noise"}  # the example's own
     others |= {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(GymnasiumEnv)}  # which has a page only where it is installed
-    others |= {"--only", "--help", "--logdir"}
+    others |= {"--only", "--help", "--help-all", "--version", "--logdir"}
     for path in (README, *PAGES):
         unknown = set(re.findall(r"(?<![\w-])--[a-z][a-z0-9-]*", path.read_text())) - known - others
         assert not unknown, f"{path.name}: {unknown}"

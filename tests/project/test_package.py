@@ -3,7 +3,9 @@
 The sdist and, from it, the wheel are built with the packages of this environment, without the network; tests/try_package.sh installs both.
 """
 
+import importlib.util
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -21,7 +23,7 @@ FOLDERS = {"envs": "hindrl_jax/envs", "experts": "hindrl_jax/experts"}  # at the
 def built(tmp_path_factory):
     """A folder with an sdist, and a wheel that was built from it."""
     sources, built = tmp_path_factory.mktemp("sources"), tmp_path_factory.mktemp("built")
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, sources)
     for name in ("hindrl_jax", *FOLDERS):
         shutil.copytree(ROOT / name, sources / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
@@ -64,6 +66,28 @@ def test_wheel_and_sdist_hold_every_file_once(built, wheel):
         inside = {member.name.partition("/")[2] for member in sdist if member.isfile()}
     assert expected <= inside
     assert not [name for name in inside if name.startswith(tuple(f"{top}/" for top in FOLDERS))]
+
+
+def test_what_pypi_shows_has_no_link_into_the_repository(wheel):
+    name = next(name for name in wheel.namelist() if name.endswith(".dist-info/METADATA"))
+    metadata = wheel.read(name).decode()
+    assert "Description-Content-Type: text/markdown" in metadata
+    assert "import hindrl_jax as hindrl" in metadata
+    targets = re.findall(r"\]\(([^)]+)\)", metadata)
+    assert "https://arxiv.org/abs/2112.00597" in targets
+    assert [target for target in targets if not target.startswith("https://")] == []
+
+
+def test_with_the_address_of_the_repository_links_and_pictures_lead_there():
+    spec = importlib.util.spec_from_file_location("project_setup", ROOT / "setup.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    text = "| ![film](docs/film.gif) |\n|---|\n| words |\n\n[page](docs/page.md#there) [paper](https://arxiv.org/abs/1)\n"
+    there = "https://example.org/hindrl"
+    assert module.description(text, there) == (
+        f"| ![film]({there}/raw/main/docs/film.gif) |\n|---|\n| words |\n\n[page]({there}/blob/main/docs/page.md#there) [paper](https://arxiv.org/abs/1)\n"
+    )
+    assert module.description(text, None) == "page [paper](https://arxiv.org/abs/1)\n"
 
 
 def test_it_works_where_envs_and_experts_are_somebody_elses(wheel, tmp_path):

@@ -64,7 +64,7 @@ def test_differences_are_taken_seed_by_seed_where_the_seeds_are_the_same(first, 
     assert paired.paired
     assert paired.difference == Interval(estimate=pytest.approx(-0.2), low=pytest.approx(-0.2), high=pytest.approx(-0.2))
     assert not unpaired.paired
-    # the largest and the smallest differences of means drawn anew, each in one of 16 draws: 0.8 - 0.9 and 0.7 - 1.0
+    # the largest and the smallest differences of resampled means, each in one of 16 draws: 0.8 - 0.9 and 0.7 - 1.0
     assert unpaired.difference == Interval(estimate=pytest.approx(-0.2), low=pytest.approx(-0.3), high=pytest.approx(-0.1))
 
 

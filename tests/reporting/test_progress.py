@@ -97,7 +97,7 @@ def test_bc_counts_updates():
     assert re.search(r"300 +1,500 +2\.0", screen.file.getvalue())
 
 
-def test_a_second_training_begins_anew():
+def test_a_second_training_starts_again():
     screen = console()
     progress = hindrl.ProgressBar(console=screen, lines=2)
     for _ in range(2):

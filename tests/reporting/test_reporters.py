@@ -1,4 +1,4 @@
-"""Reporters: what TensorBoard's own reader finds in the files, and what W&B is told. No training: the rows are made up."""
+"""Reporters: what TensorBoard's own reader finds in the files, and what W&B is sent. No training: the rows are made up."""
 
 import dataclasses
 import json
@@ -84,7 +84,7 @@ def test_tensorboard_reads_each_seed_and_their_mean(tmp_path):
 
 
 @pytest.mark.parametrize("seeds", [(3, 4), (3,)])
-def test_a_reporter_begins_anew_after_a_run_that_was_interrupted(tmp_path, seeds):
+def test_a_reporter_starts_again_after_a_run_that_was_interrupted(tmp_path, seeds):
     report = hindrl.TensorBoardReporter(tmp_path)
     report(result(ROWS))
     again = [row for row in ROWS[:2] if row.seed in seeds]
@@ -166,7 +166,7 @@ class FakeRun:
 
 @pytest.fixture
 def wandb(monkeypatch):
-    """What of the package is used, writing down what it is told."""
+    """What of the package is used, writing down what it is sent."""
     fake = SimpleNamespace(runs=[], mode="online", account=True, errors=SimpleNamespace(Error=RuntimeError), Settings=dict)
 
     def init(**arguments):

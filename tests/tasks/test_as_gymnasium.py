@@ -162,7 +162,7 @@ def assert_same(a, b):
         assert getattr(a, "dtype", None) == getattr(b, "dtype", None)
 
 
-def test_without_autoreset_only_the_chosen_begin_anew():
+def test_without_autoreset_only_the_chosen_are_reset():
     env = gymnasium.make_vec(GRID, 2, autoreset_mode="Disabled")
     env.reset(seed=0)
     before, *_ = env.step(random_actions(env, 1)[0])
@@ -180,7 +180,7 @@ def test_a_solved_episode_gives_way_to_the_next():
     assert [float(reward[0]) for _, reward, *_ in results] == [0.0, 0.0, 1.0, 0.0]
     assert [bool(info["is_success"][0]) for *_, info in results] == [False, False, True, False]
     np.testing.assert_array_equal(results[2][0]["achieved_goal"], results[2][0]["desired_goal"])
-    np.testing.assert_array_equal(results[3][0]["observation"], [[1, 0, 0, 1, 0, 0]])  # begun anew; its action was not taken
+    np.testing.assert_array_equal(results[3][0]["observation"], [[1, 0, 0, 1, 0, 0]])  # reset; its action was not taken
 
 
 def test_a_continuing_task_is_cut_by_the_horizon_alone():

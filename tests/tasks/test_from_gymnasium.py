@@ -71,7 +71,7 @@ def test_what_cannot_be_is_refused_in_a_line(name, arguments, message):
 
 @pytest.mark.parametrize("says", ["is_success", "success", "reward"])
 def test_an_episode_ends_at_its_goal_with_its_true_last_observation(simulators, says):
-    """Three points; the first goes to its goal, the second stands still, the third goes on when it has arrived and begins anew."""
+    """Three points; the first goes to its goal, the second stands still, the third goes on when it has arrived and is reset."""
     env = hindrl.make(POINT, says=says)
     three = simulators(env, 3)
     observation, goal = three.begin(np.array([4, 5, 6]))
@@ -101,7 +101,7 @@ def test_held_actions_are_steps_with_the_same_action_up_to_the_goal(simulators, 
     stepped.begin(np.array([4, 5]))
     wish = np.clip((goal - observation[:, 3:]) / SPEED / 3, -1, 1) * 2 * np.array([[1], [0]])
     assert (np.linalg.norm(goal - observation[:, 3:], axis=1) > 3 * 0.2).all()
-    steps = [stepped.step(wish, begin_anew=False) for _ in range(3)]
+    steps = [stepped.step(wish, autoreset=False) for _ in range(3)]
     outcome = held.step(wish)
     assert [bool(step.success[0]) for step in steps] == [False, False, True]
     assert outcome.success.tolist() == outcome.terminated.tolist() == [True, False]

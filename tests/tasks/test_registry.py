@@ -40,6 +40,27 @@ def forget(monkeypatch):
     forget()
 
 
+def test_the_robot_of_the_tutorial(monkeypatch, tmp_path, capsys):
+    """docs/tutorial.md follows examples/planar_arm.py; its training is too long for here."""
+    monkeypatch.chdir(EXAMPLES)
+    file = tmp_path / "arm.hdf5"
+    try:
+        cli.main(["demos", "record", "--env", "planar_arm:PlanarArm", "--demos", "1", "--out", str(file)])
+        cli.main(["demos", "render", str(file)])
+        assert file.with_suffix(".gif").stat().st_size > 0
+        assert parse_train(["--demos", str(file)])[0].env == make("planar_arm:PlanarArm")  # the file says which task
+        env = make("planar_arm:PlanarArm")
+        goal = env.task_goal()
+        solved = sys.modules["planar_arm"].ArmState(key=jax.random.key(0), joints=goal[2:4], pressed=jnp.array(True), step=jnp.array(3))
+        np.testing.assert_allclose(env.achieved_goal(env.observe(solved)), goal, atol=1e-5)
+        _, timestep = env.step(solved, jnp.zeros(2))
+        assert timestep.terminated
+        assert timestep.reward == 1
+    finally:
+        TASKS.pop("PlanarArm", None)
+        sys.modules.pop("planar_arm", None)
+
+
 def test_task_of_ones_own_by_the_commands(forget, tmp_path, capsys):
     """What is written down is found again by a process that has not imported the task. A whole run is in the notebook on own tasks."""
     file = tmp_path / "demos.hdf5"

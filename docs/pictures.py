@@ -1,0 +1,118 @@
+"""Draws the pictures of README and of the pages: docs/how_it_works.png, docs/environments.png, docs/epsilon_filter.png and, of the runs that
+are there, docs/panda.gif, docs/grid.gif and docs/grid_curve.png.
+
+    hindrl train --env FixedGridPickAndPlace --demos 1 --seed 2 --stop-at 0.98 --out runs/quickstart
+    hindrl train --env FixedParameterizedReach --demos 1 --seed 0 --stop-at 0.98 --out runs/reach
+    python docs/pictures.py
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+
+import jax
+import matplotlib
+import numpy as np
+from PIL import Image
+
+from hindrl_jax import cli
+from hindrl_jax.envs.cable import viewer as cable_viewer
+from hindrl_jax.envs.grid import viewer as grid_viewer
+from hindrl_jax.envs.reach import viewer as reach_viewer
+from hindrl_jax.tasks.registry import make
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Rectangle
+
+DOCS = Path(__file__).parent
+RUNS = Path("runs")
+DEMO, ROLLOUT, RELABELLED, NETWORK, INK = "#d9822b", "#8a97a6", "#2f6fb3", "#4b8f5b", "#1c2733"
+
+
+def main() -> None:
+    """Draws what can be drawn here."""
+    how_it_works(DOCS / "how_it_works.png")
+    environments(DOCS / "environments.png")
+    epsilon_filter(DOCS / "epsilon_filter.png")
+    for run, film in (("reach", "panda.gif"), ("quickstart", "grid.gif")):
+        if (RUNS / run).is_dir():
+            cli.main(["render", str(RUNS / run), "--to", str(DOCS / film)])
+    if (RUNS / "quickstart").is_dir():
+        shutil.copy(RUNS / "quickstart" / "curve.png", DOCS / "grid_curve.png")
+
+
+def how_it_works(path: Path) -> None:
+    """Demonstrations and rollouts, the goals of the demonstrations, one batch of three kinds of rows, and what learns from it."""
+    figure, axes = plt.subplots(figsize=(10, 4.1), dpi=144)
+    axes.set(xlim=(0, 100), ylim=(0, 41))
+    axes.axis("off")
+
+    def box(x: float, y: float, width: float, height: float, title: str, text: str, colour: str) -> None:
+        axes.add_patch(
+            FancyBboxPatch((x, y), width, height, boxstyle="round,pad=0,rounding_size=1.2", facecolor="white", edgecolor=colour, linewidth=2)
+        )
+        axes.text(x + width / 2, y + height - 2.6, title, ha="center", va="center", fontsize=11, color=colour, weight="bold")
+        axes.text(x + width / 2, y + (height - 4) / 2, text, ha="center", va="center", fontsize=9, color=INK, linespacing=1.4)
+
+    def arrow(start: tuple[float, float], end: tuple[float, float], text: str = "", at: tuple[float, float] = (0, 0)) -> None:
+        axes.add_patch(FancyArrowPatch(start, end, arrowstyle="-|>", mutation_scale=14, color=INK, linewidth=1.3))
+        axes.text(*at, text, ha="center", va="center", fontsize=8.5, color=INK, linespacing=1.3)
+
+    box(0, 27, 22, 12, "demonstrations", "a few solved episodes,\nactions may be noisy", DEMO)
+    box(0, 4, 22, 12, "rollouts", "episodes of the policy,\nkept in a replay buffer", ROLLOUT)
+    box(28, 17, 18, 12.5, "goals", "states that the\ndemonstrations\nreached", DEMO)
+
+    rows = ((30, DEMO, "demonstrated", "reward 1 at the end"), (19, RELABELLED, "relabelled", "reward 1 where the\nnew goal is reached"))
+    axes.text(64, 39.4, "one batch", ha="center", va="center", fontsize=11, color=INK, weight="bold")
+    for y, colour, name, note in (*rows, (8, ROLLOUT, "original", "reward 1 if solved")):
+        axes.add_patch(Rectangle((55, y - 3.5), 18, 10.5, facecolor=colour, alpha=0.16, edgecolor=colour, linewidth=2))
+        axes.text(64, y + 4.2, name, ha="center", va="center", fontsize=10, color=INK, weight="bold")
+        axes.text(64, y - 0.4, note, ha="center", va="center", fontsize=8.5, color=INK, linespacing=1.2)
+
+    box(80, 25, 20, 12, "critics", "the value of an action\nfor a goal", NETWORK)
+    box(80, 4, 20, 13, "actor", "the policy: high value,\nand near demonstrated\nactions", NETWORK)
+
+    arrow((22, 35), (55, 35))
+    arrow((22, 28.5), (28, 26))
+    arrow((46, 23.5), (55, 23))
+    arrow((22, 13), (55, 18.5), "with another goal", (39, 13.7))
+    arrow((22, 8), (55, 8), "as recorded", (39, 6.4))
+    arrow((73, 24), (80, 29))
+    arrow((73, 17), (80, 12))
+    arrow((90, 25), (90, 17), "value", (93.5, 21))
+    axes.plot([90, 90, 11, 11], [4, 0.6, 0.6, 2], color=INK, linewidth=1.3)
+    arrow((11, 0.6), (11, 4), "plays the next episodes", (50, 2))
+    figure.savefig(path, bbox_inches="tight", pad_inches=0.05, facecolor="white")
+    plt.close(figure)
+
+
+def environments(path: Path) -> None:
+    """A first state of each kind of task, side by side."""
+    pictures = []
+    for name, viewer in (("FixedGridPickAndPlace", grid_viewer), ("FixedParameterizedReach", reach_viewer), ("CableInsertion", cable_viewer)):
+        env = make(name)
+        state, _ = env.reset(jax.random.key(1))
+        pictures.append(Image.fromarray(np.asarray(viewer.frame(env, state))))
+    height = min(picture.height for picture in pictures)
+    pictures = [picture.resize((round(picture.width * height / picture.height), height), Image.Resampling.LANCZOS) for picture in pictures]
+    together = Image.new("RGB", (sum(picture.width for picture in pictures) + 20 * (len(pictures) - 1), height), "white")
+    x = 0
+    for picture in pictures:
+        together.paste(picture, (x, 0))
+        x += picture.width + 20
+    together.save(path, optimize=True)
+
+
+def epsilon_filter(path: Path) -> None:
+    """What the filter keeps of one demonstration of the arm."""
+    with tempfile.TemporaryDirectory() as folder:
+        demos = str(Path(folder) / "demos.hdf5")
+        cli.main(["demos", "record", "--env", "FixedParameterizedReach", "--demos", "1", "--out", demos])
+        cli.main(["demos", "plot", demos, "--epsilon-steps", "20", "--to", str(path)])
+
+
+if __name__ == "__main__":
+    main()
