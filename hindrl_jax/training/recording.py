@@ -103,13 +103,14 @@ def record_gymnasium(env: Watchable, policy: Demonstrator, num_demos: int, *, se
     max_attempts = 100 * num_demos if max_attempts is None else max_attempts
     rng = np.random.default_rng(seed)
     kept: list[Episodes] = []
+    played_action = getattr(env, "played_action", lambda action: np.clip(action, env.action_low, env.action_high))
     with contextlib.closing(env.watched(with_pictures=False)) as stepper:
         observation, goal = stepper.begin(rng.integers(2**32, size=1))
         for _ in range(max_attempts):
             observations, actions, ended = [observation], [], False
             while not ended:
-                action = np.asarray(policy(stepper.raw_observation(), rng), np.float32)
-                actions.append(np.clip(action, env.action_low, env.action_high))
+                action = _checked(policy(stepper.raw_observation(), rng), env)
+                actions.append(played_action(action))
                 outcome = stepper.step(action[None])
                 observations.append(outcome.next_observation)
                 ended = outcome.ended[0]
@@ -123,6 +124,18 @@ def record_gymnasium(env: Watchable, policy: Demonstrator, num_demos: int, *, se
         f"the policy reached its goal in only {len(kept)} of {max_attempts} episodes of {env.name}, but {num_demos} demonstrations are wanted: "
         "ask for fewer, or give a better one"
     )
+
+
+def _checked(action: Any, env: Environment) -> np.ndarray:
+    """What a policy has chosen, as float32, if it is an action (A,) at all.
+
+    Raises:
+      UserError: if it is not.
+    """
+    action = np.asarray(action, np.float32)
+    if action.shape != (env.action_dim,) or not np.isfinite(action).all():
+        raise UserError(f"the policy chose {action.tolist()} in {env.name}, which takes {env.action_dim} finite numbers: mend the policy")
+    return action
 
 
 def _demonstration(env: HostStepped, observations: np.ndarray, actions: np.ndarray, goal: np.ndarray) -> Episodes:
