@@ -1,4 +1,4 @@
-"""An environment of Gymnasium with whatever oddity is asked for, registered when this is imported: a point on a line, a plane, ..., goes to its goal."""
+"""An environment of Gymnasium with whatever oddity is asked for, registered when this is imported: a point goes to its goal."""
 
 import os
 import signal
@@ -10,7 +10,7 @@ from gymnasium.spaces import Box, Dict
 
 ID = "odd_env:Odd-v0"
 FAULTS = ("raise", "nan", "nan_goal", "infinite", "die", "no_success", "success_none", "success_nan", "wrong_shape", "no_reset")
-"""What goes wrong at step `when` of an episode, or, `no_reset`, when the next one is to begin."""
+"""What goes wrong at step `when` of an episode from number `episode` on, or, `no_reset`, when the next one is to begin."""
 SIGNATURES = ("new", "old_reset", "old_step", "no_seed", "no_options")
 
 
@@ -31,10 +31,12 @@ class Odd(gymnasium.Env):
         signature: str = "new",
         fault: str | None = None,
         when: int = 3,
+        episode: int = 1,
         render_mode: str | None = None,
     ):
         self.dims, self.dtype, self.reward, self.says, self.success = dims, np.dtype(dtype), reward, says, success
-        self.signature, self.fault, self.when, self.distance_threshold, self.episodes = signature, fault, when, threshold, 0
+        self.signature, self.fault, self.when, self.distance_threshold = signature, fault, when, threshold
+        self.episode, self.episodes = episode, 0
         place = Box(-2.0, 2.0, (dims,), self.dtype)
         self.observation_space = Dict(observation=Box(-9.0, 9.0, (dims + 1,), self.dtype), achieved_goal=place, desired_goal=place)
         kind = np.dtype(action)
@@ -47,7 +49,7 @@ class Odd(gymnasium.Env):
         if self.signature == "no_options" and "options" in options:
             raise TypeError("Odd.reset() got an unexpected keyword argument 'options'")
         super().reset(seed=options.get("seed"))
-        if self.fault == "no_reset" and self.episodes >= 1:
+        if self.fault == "no_reset" and self.episodes >= self.episode:
             raise RuntimeError("the door\nis shut")
         self.episodes += 1
         self.steps, self.place, self.goal = 0, *self.np_random.uniform(-1.0, 1.0, (2, self.dims))
@@ -60,7 +62,7 @@ class Odd(gymnasium.Env):
         width = np.maximum(space.high.astype(float) - space.low, 1e-9)
         self.place = np.clip(self.place + (2.0 * (action.astype(float) - space.low) / width - 1.0) / 3.0, -1.0, 1.0)
         reached = bool(self.distance(self.place, self.goal) <= self.radius)
-        now = self.steps == self.when and self.episodes >= 1
+        now = self.steps == self.when and self.episodes >= self.episode
         if now and self.fault == "raise":
             raise RuntimeError("the arm\nfell off")
         if now and self.fault == "die":

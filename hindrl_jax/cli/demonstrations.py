@@ -14,7 +14,7 @@ from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.files import check_can_write
 from hindrl_jax.base.types import Episodes
-from hindrl_jax.cli.common import ENV_HELP, console, counted, env_names, episode_key, parse, peek
+from hindrl_jax.cli.common import ENV_HELP, console, counted, env_names, environment_of, episode_key, parse, peek
 from hindrl_jax.demonstrations.convert import MINARI_PREFIX, check_target, left_out, read, restore, write
 from hindrl_jax.demonstrations.foreign import Interpretation
 from hindrl_jax.demonstrations.hdf5 import save_demonstrations
@@ -54,7 +54,7 @@ def record(arguments: list[str]) -> None:
         [
             ("options", Record),
             ("env", Annotated[env_names(name), tyro.conf.arg(help=ENV_HELP)], name),
-            ("environment", entry.environment, entry.environment()),
+            ("environment", entry.environment, environment_of(arguments, name)),
             ("expert", entry.expert, entry.expert()),
         ],
         frozen=True,
@@ -114,7 +114,8 @@ def parse_with_meaning(
         ),
     ]
     if name is not None:
-        fields.append(("environment", task(name).environment, task(name).environment()))
+        environment = environment_of(arguments, name)
+        fields.append(("environment", type(environment), environment))
     namespace = dataclasses.make_dataclass(
         "Options", [(field, kind) if default is dataclasses.MISSING else (field, kind, default) for field, kind, default in fields], frozen=True
     )

@@ -17,6 +17,7 @@ import numpy as np
 
 from hindrl_jax import STARTED
 from hindrl_jax.base.errors import UserError
+from hindrl_jax.base.steppers import SimulationFailed
 from hindrl_jax.base.types import Episodes
 from hindrl_jax.cli.common import console, counted
 from hindrl_jax.cli.signals import StopSignals
@@ -131,7 +132,7 @@ def run(spec: RunSpec, configs: Sequence[TrainConfig], writer: RunWriter | Sweep
         restore: dict[str, Any] = {"restore": checkpoints.restore} if resumes and checkpoints is not None else {}
         try:
             return fit(spec.env, demonstrations * len(configs), **runs, report=report, **restore)
-        except Diverged as error:
+        except (Diverged, SimulationFailed) as error:
             if checkpoints is None or checkpoints.steps is None:
                 raise
             raise UserError(f"{error}; the last good checkpoint, of step {checkpoints.steps}, is in {checkpoints.folder}") from error

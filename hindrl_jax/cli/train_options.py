@@ -11,12 +11,12 @@ from typing import Annotated, Any
 import tyro
 
 from hindrl_jax.base.errors import UserError
-from hindrl_jax.cli.common import ENV_HELP, env_names, parse, peek, seeds_from
+from hindrl_jax.cli.common import ENV_HELP, env_names, environment_of, parse, peek, seeds_from
 from hindrl_jax.config import TrainConfig, without_effect
 from hindrl_jax.demonstrations.convert import MINARI_PREFIX
 from hindrl_jax.runs.spec import FROM_PYTHON, RunSpec, read_spec
 from hindrl_jax.tasks.presets import Preset, original_rules, preset
-from hindrl_jax.tasks.registry import make, task
+from hindrl_jax.tasks.registry import task
 from hindrl_jax.training.checks import check_config, check_trainable
 
 
@@ -86,7 +86,7 @@ def parse_train(
       UserError: if something is not usable.
     """
     chosen = {name: peek(arguments, name) for name in ("env", "algo", "preset", "config")}
-    spec = _defaults(chosen)
+    spec = _defaults(chosen, arguments)
     fields: list[tuple[str, Any, Any, str]] = [
         ("env", env_names(chosen["env"] or spec.env.name), spec.env.name, ENV_HELP),
         ("preset", Preset, chosen["preset"] or "default", "Where the other defaults come from: our recipe, the thesis, its original code, or RLPD."),
@@ -111,7 +111,7 @@ def parse_train(
     return RunSpec(env=parsed.environment, config=parsed.training, demos=demos, seeds=_seeds(parsed.run, spec.seeds)), parsed.run
 
 
-def _defaults(chosen: dict[str, Any]) -> RunSpec:
+def _defaults(chosen: dict[str, Any], arguments: list[str]) -> RunSpec:
     """What is trained where no other flag is given."""
     if chosen["config"] is not None:
         for name in ("env", "algo", "preset"):
@@ -119,9 +119,10 @@ def _defaults(chosen: dict[str, Any]) -> RunSpec:
                 raise UserError(f"--{name} and --config exclude each other: the configuration file says it; drop one of them")
         return read_spec(Path(chosen["config"]))
     name = chosen["env"] or "FixedGridPickAndPlace"
-    config = preset(chosen["algo"] or "hindrl", chosen["preset"] or "default", env=name)
-    env_arguments = original_rules(task(name).environment) if chosen["preset"] == "original" else {}
-    return RunSpec(env=make(name, **env_arguments), config=config, demos="1", seeds=(0,))
+    rules = original_rules(task(name).environment) if chosen["preset"] == "original" else {}
+    env = environment_of(arguments, name, **rules)
+    config = preset(chosen["algo"] or "hindrl", chosen["preset"] or "default", env=env)
+    return RunSpec(env=env, config=config, demos="1", seeds=(0,))
 
 
 def _seeds(options: TrainOptions, default: tuple[int, ...]) -> tuple[int, ...]:

@@ -110,9 +110,7 @@ def _described(gymnasium_id: str, env: Any) -> Description:
         raise UserError(f"{gymnasium_id} is not goal-conditioned: its observations must be dictionaries of vectors {', '.join(_KEYS)}")
     achieved, desired = spaces["achieved_goal"].shape, spaces["desired_goal"].shape
     if achieved != desired or desired[0] < 1:
-        raise UserError(
-            f"{gymnasium_id} has achieved goals of shape {achieved} and desired goals of shape {desired}: they must be equal, and not empty"
-        )
+        raise UserError(f"{gymnasium_id} has achieved goals of shape {achieved} and desired goals of shape {desired}: they must be equal")
     low, high = action_bounds(gymnasium_id, actions)
     begun = env.reset(seed=0, options=None)
     if not (isinstance(begun, tuple) and len(begun) == 2):
@@ -169,8 +167,8 @@ def _is_whole(space: Box) -> bool:
 def action_bounds(where: str, space: Any) -> tuple[np.ndarray, np.ndarray]:
     """The lowest and the highest actions (A,) that a policy may choose, float32.
 
-    Whole numbers from a to b are chosen by rounding a number from a - 1/2 to b + 1/2, so that all of them are equally likely. A dimension whose bounds
-    are equal stays fixed.
+    Whole numbers from a to b are chosen by rounding a number from a - 1/2 to b + 1/2, so that all of them are equally likely. A dimension whose
+    bounds are equal stays fixed.
 
     Args:
       where: begins the message.

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -10,21 +11,33 @@ import sys
 import gymnasium
 import numpy as np
 import pytest
+from commands import refusal
 from odd_env import to_goal
 
 import hindrl_jax as hindrl
 from hindrl_jax.base.environments import action_from_env, action_to_env
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.steppers import SimulationFailed
+from hindrl_jax.cli.train_options import parse_train
 from hindrl_jax.tasks.presets import preset
 from hindrl_jax.tasks.simulators import Simulators
 from hindrl_jax.training.recording import record_gymnasium
 
+TINY = shlex.split(
+    "--num-envs 2 --learning-starts 48 --steps 2000 --eval-every 500 --eval-episodes 2 --updates-per-iteration 1 "
+    "--batch-size 16 --net-arch 8 --buffer-size 400"
+)
 ODD = "gymnasium:odd_env:Odd-v0"
 
 
 def recorded(env, num_demos=2):
     return record_gymnasium(env, functools.partial(to_goal, env=env), num_demos, seed=1)
+
+
+def stand_still(simulators):
+    """To the end of an episode and beyond."""
+    for _ in range(13):
+        simulators.step(np.zeros((simulators.num_envs, 1)))
 
 
 def moves(simulators):
@@ -123,8 +136,7 @@ def test_a_fault_in_mid_episode_is_one_line_with_its_step(fault, message, vector
     two = Simulators(env, 2)
     two.begin(np.array([1, 2]))
     with pytest.raises(SimulationFailed, match=message) as error:
-        for _ in range(13):
-            two.step(np.zeros((2, 1)))
+        stand_still(two)
     assert "\n" not in str(error.value)
     two.close()
 
@@ -135,11 +147,36 @@ def test_a_process_that_dies_is_one_line_and_the_others_end(capfd):
     processes = two._envs.processes
     two.begin(np.array([1, 2]))
     with pytest.raises(SimulationFailed, match="failed at step 3 of an episode: a process of it died"):
-        for _ in range(5):
-            two.step(np.zeros((2, 1)))
+        stand_still(two)
     two.close()
     assert not any(process.is_alive() for process in processes)
     assert capfd.readouterr().err == ""
+
+
+@pytest.fixture
+def odd_demonstrations(tmp_path):
+    env = hindrl.make(ODD)
+    path = tmp_path / "demos.hdf5"
+    hindrl.save_demonstrations(path, recorded(env), env=env, env_args=dataclasses.asdict(env) | {"make_kwargs": []})
+    return path
+
+
+def test_a_fault_in_training_is_one_line_and_the_last_checkpoint_stands(tmp_path, odd_demonstrations, monkeypatch, capsys):
+    """An environment that nobody has told the demonstrations of: its arguments are not compared here."""
+    monkeypatch.setattr("hindrl_jax.tasks.from_gymnasium.GymnasiumEnv.interchangeable", ("vectorization", "make_kwargs"))
+    out = tmp_path / "run"
+    arguments = ["--make-kwargs", "fault=raise", "episode=12", "--demos", odd_demonstrations, "--out", out, "--checkpoint-every", "0.05"]
+    line = refusal(capsys, "train", "--env", ODD, *arguments, *TINY)
+    assert "failed at step 3 of an episode: it raised RuntimeError: the arm fell off; the last good checkpoint, of step " in line
+    assert any(path.name.isdecimal() for path in (out / "checkpoint").iterdir())
+
+
+def test_options_of_an_environment_are_read_before_it_is_built(odd_demonstrations, capsys):
+    forever = "gymnasium:odd_env:OddForever-v0"
+    assert "give a horizon" in refusal(capsys, "train", "--env", forever)
+    spec, _ = parse_train(["--env", forever, "--horizon=9", "--make_kwargs", "dims=3", "threshold=0.1", "--demos", "x.hdf5"])
+    assert (spec.env.horizon, spec.env.goal_dim, spec.config.goal.epsilon) == (9, 3, 0.05773)
+    assert "RuntimeError: the arm fell off" in refusal(capsys, "train", "--env", forever, "--make-kwargs", "fault=raise", "when=1", "--horizon", "5")
 
 
 def test_actions_of_another_shape_are_an_error():
@@ -197,9 +234,8 @@ def test_processes_that_are_forked_say_that_jax_hangs_in_them():
             print(error)
         envs.close(terminate=True)
     """
-    process = subprocess.Popen(
-        [sys.executable, "-W", "ignore", "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
+    command, pipe = [sys.executable, "-W", "ignore", "-c", script], subprocess.PIPE
+    process = subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
     try:
         said, _ = process.communicate(timeout=60)
     except subprocess.TimeoutExpired:
