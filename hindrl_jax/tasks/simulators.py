@@ -289,7 +289,8 @@ class Simulators:
                 f"actions of shape {np.shape(actions)} are not those of {self.num_envs} environments: give {(self.num_envs, *space.shape)}"
             )
         self._steps += 1
-        moment = f"at step {self._steps.max()} of an episode"
+        first, last = self._steps.min(), self._steps.max()  # nobody says which of the environments it is that fails
+        moment = f"at step {first}{'' if first == last else f' to {last}'} of an episode"
         with self._failure(moment):
             self._observed, rewards, terminated, truncated, info = self._envs.step(played_actions(actions, space))
             success = self._successes(rewards, info)

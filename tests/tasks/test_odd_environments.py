@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -167,7 +168,9 @@ def test_a_fault_in_training_is_one_line_and_the_last_checkpoint_stands(tmp_path
     out = tmp_path / "run"
     arguments = ["--make-kwargs", "fault=raise", "episode=12", "--demos", odd_demonstrations, "--out", out, "--checkpoint-every", "0.05"]
     line = refusal(capsys, "train", "--env", ODD, *arguments, *TINY)
-    assert "failed at step 3 of an episode: it raised RuntimeError: the arm fell off; the last good checkpoint, of step " in line
+    assert re.search(
+        "failed at step 3( to [0-9]+)? of an episode: it raised RuntimeError: the arm fell off; the last good checkpoint, of step ", line
+    )
     assert any(path.name.isdecimal() for path in (out / "checkpoint").iterdir())
 
 
