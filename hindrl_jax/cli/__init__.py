@@ -72,6 +72,11 @@ def _set_up_jax() -> None:
         jax.config.update("jax_num_cpu_devices", cores or 1)
 
 
+def _complain(text: str) -> None:
+    """Writes a line to standard error, whatever is in it: names of files need not be texts."""
+    print(f"hindrl: {text}".encode(errors="backslashreplace").decode(), file=sys.stderr)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the `hindrl` command; with arguments given, runs within this process as it is."""
     if arguments is None:
@@ -83,11 +88,11 @@ def main(arguments: list[str] | None = None) -> None:
             print(_usage(), flush=True)
             return
         with warnings.catch_warnings(), interrupts_that_last():
-            warnings.showwarning = lambda message, *_, **__: print(f"hindrl: warning: {message}", file=sys.stderr)
+            warnings.showwarning = lambda message, *_, **__: _complain(f"warning: {message}")
             command, rest = _find(arguments)
             command(rest)
     except UserError as error:
-        print(f"hindrl: {one_line(error)}", file=sys.stderr)
+        _complain(one_line(error))
         sys.exit(2)
     except KeyboardInterrupt:
         print("hindrl: interrupted", file=sys.stderr)

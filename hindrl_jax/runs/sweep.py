@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -46,7 +47,7 @@ class SweepWriter:
           UserError: if the path holds something else, or a sweep and neither `overwrite` nor `resume` is on, or cannot be written.
         """
         self.path, self.settings, self.resume = path, settings, resume
-        there = [name for name in (*RUN_FILES, SWEEP_SETTINGS, SWEEP, SWEEP_CURVES) if (path / name).exists()]
+        there = [name for name in (*RUN_FILES, SWEEP_SETTINGS, SWEEP, SWEEP_CURVES) if os.path.exists(path / name)]
         if there and not ((overwrite or resume) and SWEEP_SETTINGS in there):
             raise UserError(f"{path} already holds {', '.join(there)}: choose another --out, or replace a sweep with --overwrite")
         specs = [dataclasses.replace(spec, config=with_values(spec.config, setting)) for setting in settings]
