@@ -22,8 +22,19 @@ ENV_HELP = "The environment; `hindrl envs` lists them. Any goal-conditioned one 
 console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
 
 
+MOST_SEEDS, MOST_EPISODES = 65_536, 1_000_000
+
+
+def check_episodes(episodes: int, doing: str) -> None:
+    """Refuses a number of episodes that cannot be played, or takes for ever."""
+    if not 1 <= episodes <= MOST_EPISODES:
+        raise UserError(f"--episodes {episodes} is too {'few' if episodes < 1 else 'many'}: {doing} 1 to {MOST_EPISODES}")
+
+
 def seeds_from(count: int, first: int) -> tuple[int, ...]:
     """That many seeds, one after the other."""
+    if count > MOST_SEEDS:
+        raise UserError(f"--seeds {count} is too many: train at most {MOST_SEEDS} side by side")
     if not 0 <= first <= 2**32 - count:
         raise UserError(f"--seed {first} is not usable: choose a whole number from 0 to {2**32 - count}")
     return tuple(range(first, first + count))

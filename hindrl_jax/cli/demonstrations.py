@@ -14,7 +14,7 @@ from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.files import check_can_write
 from hindrl_jax.base.types import Episodes
-from hindrl_jax.cli.common import ENV_HELP, console, counted, env_names, environment_of, episode_key, parse, peek
+from hindrl_jax.cli.common import ENV_HELP, check_episodes, console, counted, env_names, environment_of, episode_key, parse, peek
 from hindrl_jax.demonstrations.convert import MINARI_PREFIX, check_target, left_out, read, restore, write
 from hindrl_jax.demonstrations.foreign import Interpretation
 from hindrl_jax.demonstrations.hdf5 import save_demonstrations
@@ -181,8 +181,7 @@ def render(arguments: list[str]) -> None:
     states = [demo.states for demo in recording.demonstrations]
     if any(one is None for one in states):
         raise UserError(f"{options.source}: holds no states of one of our environments, which a film takes; render what hindrl demos record wrote")
-    if options.episodes < 1:
-        raise UserError(f"--episodes {options.episodes} is too few: film at least 1")
+    check_episodes(options.episodes, "film")
     for demo in (options.demo, options.demo + options.episodes - 1):
         check_demo(demo, len(states), options.source)
     path = options.to or beside(options.source, ".gif")

@@ -31,6 +31,7 @@ from hindrl_jax.runs.reporter import Reporter
 from hindrl_jax.runs.spec import CHECKPOINTS, FROM_PYTHON, RunSpec
 from hindrl_jax.runs.sweep import SweepWriter
 from hindrl_jax.runs.writer import RunWriter
+from hindrl_jax.training.checks import check_demonstrations, check_memory
 from hindrl_jax.training.experiment import Diverged, fit
 from hindrl_jax.training.recording import record_demonstrations
 from hindrl_jax.training.result import Result
@@ -81,6 +82,9 @@ def demonstrations_of(spec: RunSpec) -> list[Episodes]:
 def run(spec: RunSpec, configs: Sequence[TrainConfig], writer: RunWriter | SweepWriter | None, checkpoints: Checkpoints | None) -> Result:
     """Trains all seeds of all configs at once, with a progress bar; each of the writer's runs gets those of its config. Without it, quietly."""
     resumes = writer is not None and writer.resume
+    num_demos = int(spec.demos) if is_number(spec.demos) else 1
+    check_demonstrations(num_demos)
+    check_memory(spec.env, configs[0], len(spec.seeds) * len(configs), num_demos)
     demonstrations = checkpoints.load_demonstrations() if resumes and checkpoints.has_demonstrations else demonstrations_of(spec)
     num_seeds = len(spec.seeds)
     seeds = f"seed {spec.seeds[0]}" if num_seeds == 1 else f"{num_seeds} seeds from {spec.seeds[0]}"

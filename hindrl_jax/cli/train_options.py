@@ -152,4 +152,4 @@ def parse_resume(arguments: list[str], program: str) -> ResumeOptions:
 
 def is_number(demos: str) -> bool:
     """Whether demonstrations are given as a number to record."""
-    return re.fullmatch(r"[+-]?\d+", demos) is not None
+    return re.fullmatch(r"[+-]?[0-9]{1,100}", demos) is not None

@@ -111,6 +111,8 @@ class Checkpoints:
         if layout != LAYOUT:
             raise UserError(f"{path} has layout {layout}, and this version of hindrl_jax reads {LAYOUT}: go on with the version that wrote it")
         _check_shapes(path, found, _shapes(target))
+        if not all(isinstance(progress[name], int | float) for name in _COUNTERS):
+            raise UserError(f"{path} is damaged (its counters are no numbers): remove it to begin again")
         with self._damage(path), _plainly_named(path) as named, ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
             arrays = checkpointer.restore(named, args=ocp.args.Composite(arrays=ocp.args.StandardRestore(target))).arrays
             leaves = [_as(shapes[name], arrays[name]) for name in shapes]
@@ -162,9 +164,9 @@ class Checkpoints:
             known = {field.name for field in dataclasses.fields(Episodes)}
             fields: dict[str, Any] = {name: array for name, array in read_arrays(path).items() if name in known}
             stacked = Episodes(**fields)
-        except DAMAGED_ARCHIVE as error:
+            return [stacked.replace(**{name: leaf[i] for name, leaf in fields.items()}) for i in range(len(stacked.lengths))]
+        except (*DAMAGED_ARCHIVE, IndexError) as error:
             raise UserError(f"{path} is damaged ({one_line(error)}): train again") from error
-        return [stacked.replace(**{name: leaf[i] for name, leaf in fields.items()}) for i in range(len(stacked.lengths))]
 
     def _remove_folders(self, *, but: Path | None) -> None:
         """Removes older checkpoints and what was not finished."""
@@ -193,7 +195,9 @@ class Checkpoints:
         try:
             with _unheard_when_late():
                 yield
-        except (OSError, ValueError, KeyError, TypeError) as error:  # what libraries say of bytes that make no sense
+        except UserError:
+            raise
+        except Exception as error:  # what libraries say of bytes that make no sense
             raise UserError(f"{path} is damaged ({one_line(error)[:200]}): remove it to begin again") from error
 
 

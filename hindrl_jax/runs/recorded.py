@@ -69,7 +69,7 @@ def read_recorded(path: Path, label: str | None = None) -> RecordedRun:
         total = None if summary is None else float(summary["train_seconds"])
     except FileNotFoundError:
         raise UserError(f"{path} has no {METRICS} yet: wait for its first evaluation, or leave it out") from None
-    except (OSError, ValueError, LookupError, TypeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"{path} is damaged ({one_line(error)}): leave it out, or remove it and train again") from error
     if not len(columns["success"]):
         raise UserError(f"{path} has no evaluation of all its seeds yet: wait for the first, or leave it out")

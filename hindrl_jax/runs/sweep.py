@@ -130,6 +130,6 @@ def read_sweep(path: Path) -> tuple[RunSpec, list[dict[str, float]]]:
             with_values(spec.config, setting)
     except UserError:
         raise
-    except (OSError, UnicodeDecodeError, ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
+    except (OSError, UnicodeDecodeError, ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"{file} does not tell the settings of a sweep ({one_line(error)}): start the sweep again") from error
     return spec, settings

@@ -29,6 +29,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from hindrl_jax.base.compilation import in_float32
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.tasks._goal_task import NEVER, Observation, Running, draw_seed, goal_task, programs, vector_programs
 from hindrl_jax.tasks.ids import check_not_forked
@@ -50,6 +51,7 @@ class GoalEnv(gymnasium.Env[Observation, np.ndarray]):
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012, as Gymnasium reads it off the class
 
+    @in_float32
     def __init__(self, name: str, *, render_mode: str | None = None, continuing_task: bool = False, **arguments: Any):
         self._task = goal_task(name, arguments, render_mode, continuing_task)
         self.observation_space, self.action_space = self._task.observation_space, self._task.action_space
@@ -59,6 +61,7 @@ class GoalEnv(gymnasium.Env[Observation, np.ndarray]):
         self._episode = 0
         self._state: Any = None
 
+    @in_float32
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         """Starts an episode: the first of the seed's episodes, or without a seed the next."""
         check_not_forked()
@@ -72,6 +75,7 @@ class GoalEnv(gymnasium.Env[Observation, np.ndarray]):
             self._state, row = self._start(np.uint32(self._seed), np.int32(self._episode))
         return self._task.unpack(row)[0], {"is_success": False}
 
+    @in_float32
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Takes one step: action (A,), clipped to [-1, 1].
 
@@ -91,6 +95,7 @@ class GoalEnv(gymnasium.Env[Observation, np.ndarray]):
         """1 where the goal is reached, else 0: goals (..., G) -> (...) float32. `info` is not used."""
         return self._task.compute_reward(achieved_goal, desired_goal, info)
 
+    @in_float32
     def render(self) -> np.ndarray | None:
         """A picture (H, W, 3) uint8 of the present state; None without a render mode."""
         return None if self.render_mode is None else self._task.picture(self._state)
@@ -112,6 +117,7 @@ class GoalVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
       UserError: as `GoalEnv`, and for a horizon that is none.
     """
 
+    @in_float32
     def __init__(
         self,
         name: str,
@@ -138,6 +144,7 @@ class GoalVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         self._start, self._restart, self._step = vector_programs(self._task.env, continuing_task, min(int(limit), NEVER), self.autoreset_mode)
         self._running: Running | None = None
 
+    @in_float32
     def reset(self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         """Starts episodes everywhere, or where options["reset_mask"] (E,) says so.
 
@@ -160,6 +167,7 @@ class GoalVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
             self._running = self._restart(self._running, chosen, seeds, is_new)
         return self._task.unpack(self._running.rows)[0], self._info(np.zeros(self.num_envs, bool), chosen)
 
+    @in_float32
     def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Takes one step of all: actions (E, A), clipped to [-1, 1].
 
@@ -184,6 +192,7 @@ class GoalVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         """As of `GoalEnv`."""
         return self._task.compute_reward(achieved_goal, desired_goal, info)
 
+    @in_float32
     def render(self) -> tuple[np.ndarray, ...] | None:
         """A picture (H, W, 3) uint8 of each environment; None without a render mode."""
         if self.render_mode is None:

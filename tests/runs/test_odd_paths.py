@@ -75,7 +75,11 @@ def test_a_run_is_stopped_and_resumed_where_the_name_is_odd(tmp_path, monkeypatc
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [("n" * 256, "longer than 255 bytes"), ("ü" * 128, "longer than 255 bytes"), ("d" * 200 + "/" + ("d" * 200 + "/") * 20 + "x", "it is longer than")],
+    [
+        ("n" * 256, "longer than 255 bytes"),
+        ("ü" * 128, "longer than 255 bytes"),
+        ("d" * 200 + "/" + ("d" * 200 + "/") * 20 + "x", "it is longer than"),
+    ],
 )
 def test_a_name_that_the_disk_does_not_take_is_refused_before_anything_is_done(tmp_path, capsys, name, message):
     assert message in refusal(capsys, "train", "--out", tmp_path / name)
