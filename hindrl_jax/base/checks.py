@@ -6,7 +6,6 @@ import sys
 from types import UnionType
 from typing import Any, ClassVar, Literal, get_args, get_origin, get_type_hints
 
-
 LARGEST = 2**31 - 1
 """The largest whole number that is counted to: counters are int32."""
 

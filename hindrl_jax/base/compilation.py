@@ -11,8 +11,8 @@ from typing import ParamSpec, TypeVar
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
-
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 def in_float32(function: Callable[P, R]) -> Callable[P, R]:

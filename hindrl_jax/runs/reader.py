@@ -220,16 +220,16 @@ def _check_parameters(file: Path, spec: RunSpec, found: tuple[Policy, GoalTable]
 def _shapes_of(spec: RunSpec) -> tuple[Policy, GoalTable]:
     """The shapes of a run's policies and behavioural goals, leaves tuples (S, ...); None where any number will do."""
     num_seeds, env = len(spec.seeds), hold(spec.env, spec.config.num_held, chunks=spec.config.action_chunks)
-    observation, goal = (jax.ShapeDtypeStruct((dim,), jnp.float32) for dim in (env.observation_dim, env.goal_dim))
-    scale: Any = InputScale(observation=observation, goal=goal, observation_centre=observation, goal_centre=goal)
+    dims = dict(observation=env.observation_dim, goal=env.goal_dim, observation_centre=env.observation_dim, goal_centre=env.goal_dim)
+    vectors: dict[str, Any] = {name: jax.ShapeDtypeStruct((dim,), jnp.float32) for name, dim in dims.items()}
 
     def fresh(key: jax.Array, scale: InputScale) -> Policy:
         return policy(init(key, scale, spec.config, action_dim=env.action_dim), average=True)
 
-    of_one = jax.eval_shape(fresh, jax.random.key(0), scale)
+    of_one = jax.eval_shape(fresh, jax.random.key(0), InputScale(**vectors))
     policies = jax.tree.map(lambda leaf: _Shape((num_seeds, *leaf.shape)), of_one)
-    goals: Any = GoalTable(goals=_Shape((num_seeds, None, env.goal_dim)), count=_Shape((num_seeds,)))
-    return policies, goals
+    table: dict[str, Any] = dict(goals=_Shape((num_seeds, None, env.goal_dim)), count=_Shape((num_seeds,)))
+    return policies, GoalTable(**table)
 
 
 def _input_scale(saved: dict[str, jax.Array]) -> InputScale:

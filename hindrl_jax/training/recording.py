@@ -74,8 +74,8 @@ def record(key: Array, env: Environment, expert: Expert, num_demos: int, *, max_
     needed, free = 4 * batch_size * env.horizon * (env.observation_dim + env.action_dim + state_dim(env)), free_memory(seed_mesh(1))
     if free is not None and needed > free:
         raise UserError(
-            f"{batch_size} episodes of {env.horizon} steps side by side take {needed / 2**30:,.1f} GiB of memory, and {free / 2**30:,.1f} GiB are free: "
-            "lower horizon, or the number of demonstrations"
+            f"{batch_size} episodes of {env.horizon} steps side by side take {needed / 2**30:,.1f} GiB of memory, and {free / 2**30:,.1f} GiB are "
+            "free: lower horizon, or the number of demonstrations"
         )
     play_batch = _expert_player(env, expert, batch_size)
     kept: list[Episodes] = []
