@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+import shlex
 import sys
 import time
 import warnings
@@ -158,7 +159,7 @@ def _stop(result: Result, number: int, writer: RunWriter | SweepWriter, checkpoi
         said = "no checkpoint was asked for"
     else:
         checkpoints.save(result)
-        said = f"go on with `hindrl {'sweep' if isinstance(writer, SweepWriter) else 'train'} --resume {writer.path}`"
+        said = f"go on with `hindrl {'sweep' if isinstance(writer, SweepWriter) else 'train'} --resume {shlex.quote(str(writer.path))}`"
     print(f"hindrl: stopped after {result.steps_done:,} of {result.config.num_steps:,} steps; {said}", file=sys.stderr)
     sys.exit(128 + number)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -171,7 +172,7 @@ def load_run(path: str | os.PathLike[str], *, last: bool = False) -> Run:
     spec = read_spec(path)
     file = path / PARAMETERS
     if not file.exists():
-        raise UserError(f"{path} holds no {PARAMETERS}: the run did not finish; go on with it by `hindrl train --resume {path}`")
+        raise UserError(f"{path} holds no {PARAMETERS}: the run did not finish; go on with it by `hindrl train --resume {shlex.quote(str(path))}`")
     try:
         tree = unflatten_dict({name: jnp.asarray(array) for name, array in read_arrays(file).items()}, sep="/")
         goals = GoalTable(goals=tree["behavioural_goals"]["goals"], count=tree["behavioural_goals"]["count"])
@@ -208,7 +209,8 @@ def _check_parameters(file: Path, spec: RunSpec, found: tuple[Policy, GoalTable]
                 f"{file} does not fit {CONFIG} beside it: that asks for an array {tuple('any' if n is None else n for n in shape)} in {name}, and "
                 f"there is {there}; put back the {CONFIG} of the run, or train again"
             )
-        if not jnp.issubdtype(array.dtype, jnp.number) or not bool(jnp.isfinite(array).all()):
+        real = jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)
+        if not real or not bool(jnp.isfinite(array).all()):
             raise UserError(f"{file} holds what is no finite number in {name}, so its policies cannot be played: train again")
     if arrays:
         raise UserError(f"{file} does not fit {CONFIG} beside it: that asks for no array in {next(iter(arrays))}; put back the {CONFIG} of the run")

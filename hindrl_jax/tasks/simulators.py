@@ -134,7 +134,7 @@ def _described(gymnasium_id: str, env: Any) -> Description:
         if not np.isfinite(success_reward):
             raise UserError(f"{gymnasium_id} does not say when a goal is reached: compute_reward gives {success_reward} for the goal itself")
     threshold = getattr(env.unwrapped, "distance_threshold", None)
-    is_number = isinstance(threshold, numbers.Real) and 0.0 <= float(threshold) < np.inf
+    is_number = np.ndim(threshold) == 0 and isinstance(np.asarray(threshold).item(), numbers.Real) and 0.0 <= float(threshold) < np.inf
     return Description(
         observation_dim=spaces["observation"].shape[0],
         goal_dim=desired[0],

@@ -127,7 +127,7 @@ def _numbers_in_memory(env: Environment, config: TrainConfig, num_demos: int) ->
         "demonstrations: horizon, the number of demonstrations": demonstrations,
         "replay: buffer_size": replay,
         "batches: batch_size, n_step, updates_per_iteration": drawn,
-        "networks: net_arch, num_critics": networks,
+        "networks: net_arch, num_critics, num_quantiles": networks,
         "environments: num_envs": config.num_envs * (dim + state_dim(env) + sum(widths)),
         "evaluations: eval_episodes": config.eval_episodes * (dim + state_dim(env) + sum(widths)),
     }

@@ -49,27 +49,8 @@ def everything(group, prefix=""):
 
 @st.composite
 def mutations(draw):
-    kind = draw(
-        st.sampled_from(
-            [
-                "soft",
-                "hard",
-                "external",
-                "dangling",
-                "circle",
-                "type",
-                "shape",
-                "value",
-                "rename",
-                "attribute",
-                "remove",
-                "root",
-                "text",
-                "odd",
-                "mask",
-            ]
-        )
-    )
+    mild = ["soft", "hard", "external", "rename", "attribute", "root", "text", "odd", "mask"]
+    kind = draw(st.sampled_from([*mild, *mild, "dangling", "circle", "type", "shape", "value", "remove"]))
     return (
         kind,
         draw(SHARE),
@@ -158,11 +139,11 @@ def mutate(path, mutation):
 @st.composite
 def meanings(draw):
     options = dict(
-        observation_keys=draw(st.sampled_from([KEYS, KEYS, KEYS, ("objects", "goal"), ("obs",), ()])),
-        solved=draw(st.sampled_from(["dones", "dones", "reward", "all"])),
+        observation_keys=draw(st.sampled_from([KEYS] * 9 + [("objects", "goal"), ("obs",), ()])),
+        solved=draw(st.sampled_from(["dones", "dones", "dones", "reward", "all"])),
         sparse_rewards=draw(st.booleans()),
         repeat_last_observation=draw(st.booleans()),
-        filter_key=draw(st.sampled_from([None, None, None, "train", "new", "nothing"])),
+        filter_key=draw(st.sampled_from([None] * 6 + ["train", "new", "nothing"])),
     )
     return options | ({"cut": draw(st.booleans())} if options["solved"] != "all" else {})
 
