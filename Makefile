@@ -14,7 +14,7 @@ NEWEST_PIP = $(subst .venv,.venv-newest,$(PIP)) --upgrade --upgrade-strategy eag
 NEWEST_EXTRAS = .[minari,tensorboard,video]
 NEWEST_TOOLS = pytest pytest-xdist hypothesis ipython
 
-.PHONY: train test test-newest test-versions test-slow test-interop coverage lint docs check-docs package bench clean
+.PHONY: train test test-newest test-versions test-slow test-fuzz test-interop coverage lint docs check-docs package bench clean
 
 train: .venv/.installed  ## one demonstration, one seed, until it is solved: under a minute
 	.venv/bin/hindrl train --env FixedGridPickAndPlace --algo hindrl --demos 1 --seed 2 --stop-at 0.98 --out runs/quickstart --overwrite
@@ -30,7 +30,10 @@ test-newest: .venv-newest/bin/python  ## the fast tests with the newest JAX, Fla
 test-versions: test test-newest  ## both ends of what is supported: the locked versions, and the newest
 
 test-slow: .venv/.installed-test  ## the learning tests, which take minutes each
-	.venv/bin/python -m pytest -m slow
+	.venv/bin/python -m pytest -m slow --ignore tests/fuzz
+
+test-fuzz: .venv/.installed-test  ## 2,000 drawn inputs: must be accepted or refused in one line; FUZZ_SEED=7 draws others
+	.venv/bin/python -m pytest -m slow tests/fuzz
 
 test-interop: tests/interop/.venv/.installed  ## robomimic's own tools on our files, and ours on its files
 	tests/interop/.venv/bin/python -m pytest tests/interop

@@ -51,6 +51,9 @@ class GridTask(abc.ABC):
         for field in ("size", "num_objects", "horizon"):
             if getattr(self, field) < 1:
                 raise ValueError(f"{field} must be at least 1, got {getattr(self, field)}.")
+        for field, most in (("size", 2**15), ("num_objects", 100)):  # the cells are counted in int32, and each object is a part of the program
+            if getattr(self, field) > most:
+                raise ValueError(f"{field} must be at most {most}, got {getattr(self, field)}.")
 
     @property
     def observation_dim(self) -> int:

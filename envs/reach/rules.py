@@ -65,7 +65,7 @@ class ReachTask(abc.ABC):
         check_types(self)
         check(
             self,
-            num_waypoints=(self.num_waypoints >= 1, "at least 1"),
+            num_waypoints=(1 <= self.num_waypoints <= 1000, "at least 1 and at most 1000"),
             horizon=(self.horizon >= 1, "at least 1"),
             position_tolerance=(self.position_tolerance > 0, "greater than 0"),
             rotation_tolerance=(self.rotation_tolerance > 0, "greater than 0"),

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-import math
+import sys
 from types import UnionType
 from typing import Any, ClassVar, Literal, get_args, get_origin, get_type_hints
+
+LARGEST = 2**31 - 1
+"""The largest whole number that is counted to: counters are int32."""
 
 
 def check_types(instance: object) -> None:
@@ -32,7 +35,9 @@ def _matches(value: object, hint: Any) -> bool:
         hints = arguments[:1] * len(value) if isinstance(value, tuple) and arguments[-1] is Ellipsis else arguments
         return isinstance(value, tuple) and len(value) == len(hints) and all(map(_matches, value, hints))
     if hint is float:
-        return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool) and abs(value) <= LARGEST
     return isinstance(value, hint) and (hint is bool or not isinstance(value, bool))
 
 
@@ -44,4 +49,6 @@ def _in_words(hint: Any) -> str:
         return " or ".join(_in_words(argument) for argument in arguments)
     if origin is tuple:
         return f"a list, each item {_in_words(arguments[0])}" if arguments[-1] is Ellipsis else f"({', '.join(map(_in_words, arguments))})"
-    return {int: "a whole number", float: "a finite number", bool: "true or false", type(None): "none"}.get(hint, f"a {hint.__name__}")
+    return {int: f"a whole number of at most {LARGEST}", float: "a finite number", bool: "true or false", type(None): "none"}.get(
+        hint, f"a {hint.__name__}"
+    )

@@ -1,12 +1,29 @@
-"""Compiled programs are kept on disk, so that a second start takes seconds."""
+"""How programs are compiled: in float32, and kept on disk, so that a second start takes seconds."""
 
 from __future__ import annotations
 
+import functools
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import ParamSpec, TypeVar
 
 import jax
 from jax.experimental.compilation_cache import compilation_cache
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def in_float32(function: Callable[P, R]) -> Callable[P, R]:
+    """The function, in which JAX computes with 32 bits, as all of this project does, also where it is set to 64 (JAX_ENABLE_X64)."""
+
+    @functools.wraps(function)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
+        with jax.enable_x64(False):
+            return function(*args, **kwargs)
+
+    return wrapped
 
 
 def keep_compiled_programs() -> None:

@@ -144,9 +144,13 @@ def action_to_env(action: Array, env: Environment) -> Array:
 
 
 def action_from_env(action: Array, env: Environment) -> Array:
-    """Maps actions (..., A) in the environment's own units to the policy's [-1, 1]; the inverse of `action_to_env`."""
+    """Maps actions (..., A) in the environment's own units to the policy's [-1, 1]; the inverse of `action_to_env`.
+
+    A dimension whose bounds are equal has one action only, which is 0 to the policy.
+    """
     low, high = _action_bounds(action, env)
-    return 2.0 * (action - low) / (high - low) - 1.0
+    fixed = low == high
+    return jnp.where(fixed, 0.0, 2.0 * (action - low) / jnp.where(fixed, 1.0, high - low) - 1.0)
 
 
 def command_of(decision: Array, index: Array | int, action_dim: int) -> Array:

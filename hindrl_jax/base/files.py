@@ -21,7 +21,7 @@ def write_atomically(path: Path, content: bytes | memoryview, *, overwrite: bool
     Raises:
       UserError: it exists and `overwrite` is off, or it cannot be written.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.name[:40]}.{os.getpid()}.tmp")  # a name may be as long as the disk allows
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(temporary, "wb") as file:
@@ -60,7 +60,7 @@ def check_can_write(path: Path, *, overwrite: bool) -> None:
     Raises:
       UserError: if not.
     """
-    if path.is_dir():
+    if os.path.isdir(path):  # unlike Path's methods, these also answer for names that are too long
         raise UserError(f"{path}: is a folder; name a file")
     check_free(path, f"{path}", overwrite=overwrite, otherwise="choose another place")
 
@@ -77,26 +77,43 @@ def check_free(path: Path, where: str, *, overwrite: bool, otherwise: str) -> No
     Raises:
       UserError: if not.
     """
-    if path.exists() and not overwrite:
+    if os.path.exists(path) and not overwrite:
         raise UserError(f"{where}: exists already; replace it with --overwrite (overwrite=True), or choose another name")
     reason = why_unwritable(path.absolute().parent)
+    if reason is None and len(os.fsencode(path.name)) > 255:
+        reason = "its name is longer than 255 bytes"
     if reason:
         raise UserError(f"{where}: cannot be written, since {reason}; {otherwise}")
 
 
 def why_unwritable(folder: Path) -> str | None:
     """What is in the way of files in a folder, which may have to be made first; None if nothing is."""
-    existing = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    try:
+        str(folder).encode()
+    except UnicodeEncodeError:
+        return "its name is not UTF-8"
+    existing = next(place for place in (folder, *folder.absolute().parents) if os.path.exists(place))
     if not existing.is_dir():
         return f"{existing} is a file"
-    return None if os.access(existing, os.W_OK) else f"{existing} is read-only"
+    if not os.access(existing, os.W_OK):
+        return f"{existing} is read-only"
+    longest, longest_path = (os.pathconf(existing, limit) for limit in ("PC_NAME_MAX", "PC_PATH_MAX"))
+    if any(len(os.fsencode(part)) > longest for part in folder.parts):
+        return f"a name in it is longer than {longest} bytes"
+    if len(os.fsencode(folder.absolute())) + _ROOM_BELOW > longest_path:
+        return f"it is longer than {longest_path - _ROOM_BELOW} bytes"
+    return None
+
+
+_ROOM_BELOW = 300
+"""Bytes for the names of what is put into a folder, checkpoints being the longest of them."""
 
 
 def check_is_file(path: Path) -> None:
     """Raises a UserError where there is no file of that name."""
-    if not path.exists():
+    if not os.path.exists(path):
         raise UserError(f"{path}: no such file; check the name or record demonstrations there")
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise UserError(f"{path}: is not a file; name a file of demonstrations")
 
 

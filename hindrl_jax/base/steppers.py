@@ -8,6 +8,11 @@ from typing import Any, Protocol, TypeGuard, runtime_checkable
 import numpy as np
 
 from hindrl_jax.base.environments import Environment
+from hindrl_jax.base.errors import UserError
+
+
+class SimulationFailed(UserError):
+    """An environment that is stepped outside JAX has failed: it raised, its process died, or it gave what is no observation."""
 
 
 @dataclasses.dataclass(frozen=True)

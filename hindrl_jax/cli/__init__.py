@@ -15,7 +15,7 @@ from typing import Any
 import jax
 
 from hindrl_jax import __version__
-from hindrl_jax.base.compilation import keep_compiled_programs
+from hindrl_jax.base.compilation import in_float32, keep_compiled_programs
 from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.cli import comparison, completion, demonstrations, environments, inspection, playing, policies, reproduction, sweeping, training
 from hindrl_jax.cli.signals import interrupts_that_last
@@ -84,6 +84,20 @@ def _set_up_jax() -> None:
         jax.config.update("jax_num_cpu_devices", cores or 1)
 
 
+def _why_jax_cannot_start() -> str | None:
+    """What JAX says where it has no device, for example on a platform that is not known; None where it has one."""
+    try:
+        jax.devices()
+    except Exception as error:  # plug-ins fail in many ways
+        return one_line(error)
+    return None
+
+
+def _complain(text: str) -> None:
+    """Writes a line to standard error, whatever is in it: names of files need not be texts."""
+    print(f"hindrl: {text}".encode(errors="backslashreplace").decode(), file=sys.stderr)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the `hindrl` command; with arguments given, runs within this process as it is."""
     if arguments is None:
@@ -101,11 +115,11 @@ def main(arguments: list[str] | None = None) -> None:
             print(_usage(), flush=True)
             return
         with warnings.catch_warnings(), interrupts_that_last():
-            warnings.showwarning = lambda message, *_, **__: print(f"hindrl: warning: {message}", file=sys.stderr)
+            warnings.showwarning = lambda message, *_, **__: _complain(f"warning: {message}")
             command, rest = _find(arguments)
-            command(rest)
+            in_float32(command)(rest)
     except UserError as error:
-        print(f"hindrl: {one_line(error)}", file=sys.stderr)
+        _complain(one_line(error))
         sys.exit(2)
     except KeyboardInterrupt:
         print("hindrl: interrupted", file=sys.stderr)
@@ -113,3 +127,9 @@ def main(arguments: list[str] | None = None) -> None:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
+    except Exception:
+        reason = _why_jax_cannot_start()
+        if reason is None:
+            raise
+        _complain(f"JAX cannot compute on JAX_PLATFORMS = {os.environ.get('JAX_PLATFORMS', '')} ({reason}): choose another, or leave it out")
+        sys.exit(2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
@@ -14,7 +15,8 @@ from rich.console import Console
 
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.cli.help_pages import full_page, groups_of, missing, nearest, short_page
-from hindrl_jax.tasks.registry import TASKS
+from hindrl_jax.tasks.from_gymnasium import PREFIX
+from hindrl_jax.tasks.registry import TASKS, make
 
 _TYRO = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
 ENV_HELP = "The environment; `hindrl envs` lists them. Any goal-conditioned one of Gymnasium is gymnasium:ID, as in gymnasium:FetchReach-v4."
@@ -22,8 +24,19 @@ Brief = tuple[Mapping[str, Mapping[str, str]], Sequence[str]]  # as `short_page`
 console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
 
 
+MOST_SEEDS, MOST_EPISODES = 65_536, 1_000_000
+
+
+def check_episodes(episodes: int, doing: str) -> None:
+    """Refuses a number of episodes that cannot be played, or takes for ever."""
+    if not 1 <= episodes <= MOST_EPISODES:
+        raise UserError(f"--episodes {episodes} is too {'few' if episodes < 1 else 'many'}: {doing} 1 to {MOST_EPISODES}")
+
+
 def seeds_from(count: int, first: int) -> tuple[int, ...]:
     """That many seeds, one after the other."""
+    if count > MOST_SEEDS:
+        raise UserError(f"--seeds {count} is too many: train at most {MOST_SEEDS} side by side")
     if not 0 <= first <= 2**32 - count:
         raise UserError(f"--seed {first} is not usable: choose a whole number from 0 to {2**32 - count}")
     return tuple(range(first, first + count))
@@ -36,13 +49,40 @@ def env_names(name: str) -> Any:
 
 def peek(arguments: Sequence[str], name: str) -> str | None:
     """The value of one flag, before the rest can be understood."""
-    value = None
+    values = peek_all(arguments, name)
+    return values[0] if values else None
+
+
+def peek_all(arguments: Sequence[str], name: str) -> list[str]:
+    """The values of one flag, which may have several: what follows it up to the next flag. The last one counts where it is given several times."""
+    values: list[str] = []
     for index, argument in enumerate(arguments):
-        if argument == f"--{name}" and index + 1 < len(arguments):
-            value = arguments[index + 1]
-        elif argument.startswith(f"--{name}="):
-            value = argument.partition("=")[2]
-    return value
+        flag, equals, value = argument.partition("=")
+        if flag.replace("_", "-") != f"--{name}":
+            continue
+        if equals:
+            values = [value]
+        elif index + 1 < len(arguments):
+            rest = arguments[index + 1 :]
+            values = [rest[0], *itertools.takewhile(lambda word: not word.startswith("-"), rest[1:])]
+    return values
+
+
+def environment_of(arguments: Sequence[str], name: str, **others: Any) -> Any:
+    """The environment of a name, before the rest can be understood.
+
+    One of Gymnasium is made and looked at to know what it is, so the options without which it may not be made are read first.
+
+    Raises:
+      UserError: as `make`.
+    """
+    if name.startswith(PREFIX):
+        horizon, make_kwargs = peek(arguments, "horizon"), peek_all(arguments, "make-kwargs")
+        if make_kwargs:
+            others["make_kwargs"] = tuple(make_kwargs)
+        if horizon is not None and re.fullmatch(r"[+-]?[0-9]{1,18}", horizon):  # what is no number is refused where all options are read
+            others["horizon"] = int(horizon)
+    return make(name, **others)
 
 
 def episode_key(seed: int) -> jax.Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,7 @@ def compare(arguments: list[str]) -> None:
     for path, suffix in ((options.to, ".png"), (options.csv, ".csv")):
         if path is not None and path.suffix != suffix:
             raise UserError(f"cannot write {path.name}: the name must end in {suffix}")
-        if path is not None and not path.parent.is_dir():
+        if path is not None and not os.path.isdir(path.parent):
             raise UserError(f"cannot write {path}: there is no folder {path.parent}; make it first")
     if not options.directories:
         raise UserError("nothing to compare: give the directories of two or more runs, or of a sweep")

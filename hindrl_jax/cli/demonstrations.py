@@ -14,7 +14,7 @@ from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.files import check_can_write
 from hindrl_jax.base.types import Episodes
-from hindrl_jax.cli.common import ENV_HELP, console, counted, env_names, episode_key, parse, peek
+from hindrl_jax.cli.common import ENV_HELP, check_episodes, console, counted, env_names, environment_of, episode_key, parse, peek
 from hindrl_jax.demonstrations.convert import MINARI_PREFIX, check_target, left_out, read, restore, write
 from hindrl_jax.demonstrations.foreign import Interpretation
 from hindrl_jax.demonstrations.hdf5 import save_demonstrations
@@ -54,7 +54,7 @@ def record(arguments: list[str]) -> None:
         [
             ("options", Record),
             ("env", Annotated[env_names(name), tyro.conf.arg(help=ENV_HELP)], name),
-            ("environment", entry.environment, entry.environment()),
+            ("environment", entry.environment, environment_of(arguments, name)),
             ("expert", entry.expert, entry.expert()),
         ],
         frozen=True,
@@ -114,7 +114,8 @@ def parse_with_meaning(
         ),
     ]
     if name is not None:
-        fields.append(("environment", task(name).environment, task(name).environment()))
+        environment = environment_of(arguments, name)
+        fields.append(("environment", type(environment), environment))
     namespace = dataclasses.make_dataclass(
         "Options", [(field, kind) if default is dataclasses.MISSING else (field, kind, default) for field, kind, default in fields], frozen=True
     )
@@ -180,8 +181,7 @@ def render(arguments: list[str]) -> None:
     states = [demo.states for demo in recording.demonstrations]
     if any(one is None for one in states):
         raise UserError(f"{options.source}: holds no states of one of our environments, which a film takes; render what hindrl demos record wrote")
-    if options.episodes < 1:
-        raise UserError(f"--episodes {options.episodes} is too few: film at least 1")
+    check_episodes(options.episodes, "film")
     for demo in (options.demo, options.demo + options.episodes - 1):
         check_demo(demo, len(states), options.source)
     path = options.to or beside(options.source, ".gif")

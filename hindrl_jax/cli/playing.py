@@ -11,8 +11,7 @@ from rich import box
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from hindrl_jax.base.errors import UserError
-from hindrl_jax.cli.common import console, counted, episode_key, parse
+from hindrl_jax.cli.common import check_episodes, console, counted, episode_key, parse
 from hindrl_jax.cli.policies import PREFIX, run_directory
 from hindrl_jax.runs.reader import load_run
 from hindrl_jax.training.playing import plays_one_by_one
@@ -39,8 +38,7 @@ class Eval:
 def evaluate(arguments: list[str]) -> None:
     """Play fresh episodes with the policies of a run."""
     options = parse(Eval, arguments, "hindrl eval")
-    if options.episodes < 1:
-        raise UserError(f"--episodes {options.episodes} is too few: play at least 1")
+    check_episodes(options.episodes, "play")
     run = load_run(run_directory(options.directory), last=options.last)
     if options.backend is not None:
         run = run.in_backend(options.backend)
@@ -85,8 +83,7 @@ class Render:
 def render(arguments: list[str]) -> None:
     """Film episodes of a run's policy."""
     options = parse(Render, arguments, "hindrl render")
-    if options.episodes < 1:
-        raise UserError(f"--episodes {options.episodes} is too few: film at least 1")
+    check_episodes(options.episodes, "film")
     run = load_run(run_directory(options.directory), last=options.last)
     name = f"episode_{options.episode}_seed_{run.spec.seeds[0] if options.seed is None else options.seed}.gif"
     ships = options.directory.startswith(PREFIX)  # and so its directory is the installation's

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+import shlex
 import sys
 import time
 import warnings
@@ -17,6 +18,7 @@ import numpy as np
 
 from hindrl_jax import STARTED
 from hindrl_jax.base.errors import UserError
+from hindrl_jax.base.steppers import SimulationFailed
 from hindrl_jax.base.types import Episodes
 from hindrl_jax.cli.common import console, counted
 from hindrl_jax.cli.signals import StopSignals
@@ -30,6 +32,7 @@ from hindrl_jax.runs.reporter import Reporter
 from hindrl_jax.runs.spec import CHECKPOINTS, FROM_PYTHON, RunSpec
 from hindrl_jax.runs.sweep import SweepWriter
 from hindrl_jax.runs.writer import RunWriter
+from hindrl_jax.training.checks import check_demonstrations, check_memory
 from hindrl_jax.training.experiment import Diverged, fit
 from hindrl_jax.training.recording import record_demonstrations
 from hindrl_jax.training.result import Result
@@ -80,6 +83,9 @@ def demonstrations_of(spec: RunSpec) -> list[Episodes]:
 def run(spec: RunSpec, configs: Sequence[TrainConfig], writer: RunWriter | SweepWriter | None, checkpoints: Checkpoints | None) -> Result:
     """Trains all seeds of all configs at once, with a progress bar; each of the writer's runs gets those of its config. Without it, quietly."""
     resumes = writer is not None and writer.resume
+    num_demos = int(spec.demos) if is_number(spec.demos) else 1
+    check_demonstrations(num_demos)
+    check_memory(spec.env, configs[0], len(spec.seeds) * len(configs), num_demos)
     demonstrations = checkpoints.load_demonstrations() if resumes and checkpoints.has_demonstrations else demonstrations_of(spec)
     num_seeds = len(spec.seeds)
     seeds = f"seed {spec.seeds[0]}" if num_seeds == 1 else f"{num_seeds} seeds from {spec.seeds[0]}"
@@ -131,7 +137,7 @@ def run(spec: RunSpec, configs: Sequence[TrainConfig], writer: RunWriter | Sweep
         restore: dict[str, Any] = {"restore": checkpoints.restore} if resumes and checkpoints is not None else {}
         try:
             return fit(spec.env, demonstrations * len(configs), **runs, report=report, **restore)
-        except Diverged as error:
+        except (Diverged, SimulationFailed) as error:
             if checkpoints is None or checkpoints.steps is None:
                 raise
             raise UserError(f"{error}; the last good checkpoint, of step {checkpoints.steps}, is in {checkpoints.folder}") from error
@@ -153,7 +159,7 @@ def _stop(result: Result, number: int, writer: RunWriter | SweepWriter, checkpoi
         said = "no checkpoint was asked for"
     else:
         checkpoints.save(result)
-        said = f"go on with `hindrl {'sweep' if isinstance(writer, SweepWriter) else 'train'} --resume {writer.path}`"
+        said = f"go on with `hindrl {'sweep' if isinstance(writer, SweepWriter) else 'train'} --resume {shlex.quote(str(writer.path))}`"
     print(f"hindrl: stopped after {result.steps_done:,} of {result.config.num_steps:,} steps; {said}", file=sys.stderr)
     sys.exit(128 + number)
 

@@ -11,12 +11,12 @@ from typing import Annotated, Any
 import tyro
 
 from hindrl_jax.base.errors import UserError
-from hindrl_jax.cli.common import ENV_HELP, env_names, parse, peek, seeds_from
+from hindrl_jax.cli.common import ENV_HELP, env_names, environment_of, parse, peek, seeds_from
 from hindrl_jax.config import TrainConfig, without_effect
 from hindrl_jax.demonstrations.convert import MINARI_PREFIX, open_source
 from hindrl_jax.runs.spec import FROM_PYTHON, RunSpec, read_spec
 from hindrl_jax.tasks.presets import Preset, original_rules, preset
-from hindrl_jax.tasks.registry import make, task
+from hindrl_jax.tasks.registry import task
 from hindrl_jax.training.checks import check_config, check_trainable
 
 _FIRST_TASK = "FixedGridPickAndPlace"
@@ -122,7 +122,7 @@ def parse_train(
       UserError: if something is not usable.
     """
     chosen = {name: peek(arguments, name) for name in ("env", "algo", "preset", "config", "demos")}
-    spec = _defaults(chosen)
+    spec = _defaults(chosen, arguments)
     fields: list[tuple[str, Any, Any, str]] = [
         ("env", env_names(chosen["env"] or spec.env.name), spec.env.name, ENV_HELP),
         (
@@ -157,7 +157,7 @@ def parse_train(
     return RunSpec(env=parsed.environment, config=parsed.training, demos=demos, seeds=_seeds(parsed.run, spec.seeds)), parsed.run
 
 
-def _defaults(chosen: dict[str, Any]) -> RunSpec:
+def _defaults(chosen: dict[str, Any], arguments: list[str]) -> RunSpec:
     """What is trained where no other flag is given."""
     if chosen["config"] is not None:
         for name in ("env", "algo", "preset"):
@@ -168,10 +168,11 @@ def _defaults(chosen: dict[str, Any]) -> RunSpec:
     name = chosen["env"]
     if name is None:
         name, env_arguments = _task_of(chosen["demos"]) or (_FIRST_TASK, {})
-    config = preset(chosen["algo"] or "hindrl", chosen["preset"] or "default", env=name)
     if chosen["preset"] == "original":
         env_arguments = env_arguments | original_rules(task(name).environment)
-    return RunSpec(env=make(name, **env_arguments), config=config, demos="1", seeds=(0,))
+    env = environment_of(arguments, name, **env_arguments)
+    config = preset(chosen["algo"] or "hindrl", chosen["preset"] or "default", env=env)
+    return RunSpec(env=env, config=config, demos="1", seeds=(0,))
 
 
 def _task_of(demos: str | None) -> tuple[str, dict[str, Any]] | None:
@@ -220,4 +221,4 @@ def parse_resume(arguments: list[str], program: str) -> ResumeOptions:
 
 def is_number(demos: str) -> bool:
     """Whether demonstrations are given as a number to record."""
-    return re.fullmatch(r"[+-]?\d+", demos) is not None
+    return re.fullmatch(r"[+-]?[0-9]{1,100}", demos) is not None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shlex
 from typing import Any
 
 from rich import box
@@ -25,7 +26,7 @@ def train(arguments: list[str]) -> None:
     if peek(arguments, "resume") is not None:
         options = parse_resume(arguments, "hindrl train")
         out, spec = options.resume, read_spec(options.resume)
-        check_unfinished(out, SUMMARY, f"look at it with `hindrl eval {out}`")
+        check_unfinished(out, SUMMARY, f"look at it with `hindrl eval {shlex.quote(str(out))}`")
         writer = RunWriter(out, spec, resume=True, reporters=reporters_of(options, out))
     else:
         spec, options = parse_train(arguments, "hindrl train", train.__doc__)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, Literal
 
-from hindrl_jax.base.checks import check, check_types
+from hindrl_jax.base.checks import LARGEST, check, check_types
 from hindrl_jax.config.agent import AgentConfig
 from hindrl_jax.config.batch import BatchConfig
 from hindrl_jax.config.goal import GoalConfig
@@ -86,6 +86,12 @@ class TrainConfig:
                 "shares between 0 and 1, each larger than the one before",
             ),
         )
+        steps = self.num_steps if self.learns_from_rollouts else 0
+        updates = self.num_updates * (steps // self.steps_per_iteration + 1) if self.learns_from_rollouts else self.num_steps
+        if max(steps + self.steps_per_iteration, updates) > LARGEST:
+            raise ValueError(
+                f"steps = {self.num_steps} take {updates} gradient steps, and more than {LARGEST} of either are not counted: lower steps"
+            )
         if self.demo_reset_curriculum and self.demo_reset_ratio == 0.0:
             raise ValueError(f"demo_reset_curriculum = {self.demo_reset_curriculum} is of no use while demo_reset_ratio = 0: raise that, too")
         if self.action_chunks and self.action_hold == 1:

@@ -31,7 +31,8 @@ def with_last_observation(where: str, demo: ForeignDemonstration, used: Sequence
 
 def zero_is_success(demos: Sequence[ForeignDemonstration]) -> bool:
     """Whether the rewards of a file are -1 and 0 rather than 0 and 1. One demonstration cannot tell: it may have failed."""
-    rewards = [demo.rewards for demo in demos if demo.rewards is not None and len(demo.rewards)]
+    rewards = [demo.rewards[np.isfinite(demo.rewards)] for demo in demos if demo.rewards is not None]
+    rewards = [rows for rows in rewards if len(rows)]
     return bool(rewards) and max(rows.max() for rows in rewards) <= 0 and min(rows.min() for rows in rewards) < 0
 
 
@@ -51,9 +52,14 @@ def _end(where: str, demo: ForeignDemonstration, meaning: Interpretation, *, zer
     if meaning.solved == "all":
         return length, True
     rows, what = (demo.dones, "dones") if meaning.solved == "dones" else (demo.rewards, "rewards")
+    if what in demo.problems and meaning.solved == "dones":
+        raise UserError(f"{demo.problems[what]}; say --solved reward or --solved all")
     if rows is None:
         others = "reward or --solved all" if what == "dones" else "all"
         raise UserError(f"{where}: has no {what}, so it is not known which demonstrations solve the task; say --solved {others}")
+    if not np.isfinite(rows).all():
+        row = int(np.flatnonzero(~np.isfinite(rows))[0])
+        raise UserError(f"{where}: {what} are not finite in row {row}, so it is not known whether the task is solved; say --solved otherwise")
     times = np.flatnonzero(rows == 0 if what == "rewards" and zero_is_success else rows > 0)
     if not times.size:
         return length, False

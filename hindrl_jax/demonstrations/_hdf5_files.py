@@ -54,23 +54,77 @@ def damage_reported(where: str, what: str) -> Iterator[None]:
         raise UserError(f"{where}: {what} ({one_line(error)}); fetch the file again or {RECORD_AGAIN}") from error
 
 
-def datasets_within(group: h5py.Group, prefix: str = "") -> dict[str, np.ndarray]:
-    """All datasets below a group by their path, which gets a prefix; texts as bytes of fixed length."""
-    found = {}
+def datasets_within(group: h5py.Group, prefix: str = "", texts: set[str] | None = None) -> dict[str, np.ndarray]:
+    """All datasets below a group by their path, which gets a prefix; links of any kind are followed, and give copies.
 
-    def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
-        if isinstance(item, h5py.Dataset):
-            array = np.asarray(item[()])
-            found[prefix + name] = array.astype("S" if array.dtype.kind == "O" else array.dtype.str)  # without what h5py notes in types
+    Args:
+      group: of an open file.
+      prefix: begins the paths.
+      texts: gets the paths of texts of variable length, which are given as bytes of fixed length.
 
-    group.visititems(visit)
+    Raises:
+      UserError: a link leads nowhere or in a circle, or a dataset holds what cannot be kept.
+    """
+    found: dict[str, np.ndarray] = {}
+
+    def visit(group: h5py.Group, path: str, above: tuple[h5py.Group, ...]) -> None:
+        for name in group:
+            item = _followed(group, name, f"{group.file.filename}: {path}{name}")
+            if isinstance(item, h5py.Dataset):
+                found[path + name] = as_array(item, f"{group.file.filename}: {path}{name}")
+                if texts is not None and h5py.check_string_dtype(item.dtype) and item.dtype.kind == "O":
+                    texts.add(path + name)
+            elif isinstance(item, h5py.Group):
+                if item in above:
+                    raise UserError(f"{group.file.filename}: {path}{name} is a link to a group that it lies in, so there is no end; remove it")
+                visit(item, f"{path}{name}/", (*above, item))
+
+    visit(group, prefix, (group,))
     return found
 
 
-def datasets_beside(file: h5py.File, group: str) -> dict[str, np.ndarray]:
-    """All datasets in the other groups of a file, by their path."""
-    others = (name for name in file if name != group and isinstance(file[name], h5py.Group))
-    return {path: array for name in others for path, array in datasets_within(file[name], f"{name}/").items()}
+def _followed(group: h5py.Group, name: str, where: str) -> Any:
+    """What lies in a group under a name, also by a link."""
+    try:
+        return group[name]
+    except (KeyError, OSError) as error:
+        link = group.get(name, getlink=True)
+        if not isinstance(link, h5py.SoftLink | h5py.ExternalLink):
+            raise
+        target = f"{link.filename}:{link.path}" if isinstance(link, h5py.ExternalLink) else link.path
+        raise UserError(f"{where} is a link to {target}, where there is nothing; put that back or remove the link") from error
+
+
+def as_array(dataset: h5py.Dataset, where: str) -> np.ndarray:
+    """A dataset as an array that NumPy keeps by itself, texts as bytes of fixed length.
+
+    Raises:
+      UserError: it cannot be.
+    """
+    value = dataset[()]
+    array = np.asarray(value)
+    if h5py.check_string_dtype(dataset.dtype):
+        array = array.astype("S")
+    elif array.dtype.kind == "O" or isinstance(value, h5py.Empty):
+        raise UserError(f"{where} holds {dataset.dtype}, which is neither numbers nor texts, and cannot be kept; remove it")
+    return array if array.dtype.kind == "V" else array.astype(array.dtype.str)  # without what h5py notes in types
+
+
+def datasets_beside(file: h5py.File, group: str, texts: set[str] | None = None) -> dict[str, np.ndarray]:
+    """All datasets of a file outside a group, by their path, and those that lie right in that group; `texts` as in `datasets_within`."""
+    found: dict[str, np.ndarray] = {}
+    for name in file:
+        item = _followed(file, name, f"{file.filename}: {name}")
+        if name == group:
+            alone = [below for below in item if isinstance(_followed(item, below, f"{file.filename}: {name}/{below}"), h5py.Dataset)]
+            found |= {f"{name}/{below}": as_array(item[below], f"{file.filename}: {name}/{below}") for below in alone}
+        elif isinstance(item, h5py.Group):
+            found |= datasets_within(item, f"{name}/", texts)
+        elif isinstance(item, h5py.Dataset):
+            found[name] = as_array(item, f"{file.filename}: {name}")
+            if texts is not None and h5py.check_string_dtype(item.dtype) and item.dtype.kind == "O":
+                texts.add(name)
+    return found
 
 
 def json_attribute(value: Any) -> np.bytes_ | str:

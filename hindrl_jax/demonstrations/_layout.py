@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import h5py
 import numpy as np
@@ -21,8 +22,12 @@ _GYM_ENV_TYPE = 2
 
 
 def demonstration_names(data: h5py.Group) -> list[str]:
-    """demo_0, demo_1, ..., in the order of their numbers."""
-    return sorted((name for name in data if re.fullmatch(r"demo_\d+", name)), key=lambda name: int(name.removeprefix("demo_")))
+    """The groups in it, in the order of the numbers in their names: demo_0, demo_1, ..., or whatever else they are called."""
+
+    def natural(name: str) -> list[Any]:
+        return [int(part) if part.isdecimal() else part for part in re.split(r"([0-9]+)", name)]
+
+    return sorted((name for name in data if re.fullmatch(r"demo_[0-9]+", name) or data.get(name, getclass=True) is not h5py.Dataset), key=natural)
 
 
 def joined(where: str, key: str, before: np.ndarray, after: np.ndarray, *, advice: str) -> np.ndarray:
@@ -31,7 +36,11 @@ def joined(where: str, key: str, before: np.ndarray, after: np.ndarray, *, advic
     Raises:
       UserError: they do not belong together; the message begins with `where` and ends with the advice.
     """
-    misaligned = np.flatnonzero((after[:-1] != before[1:]).any(axis=1))
+    floats = [rows.dtype for rows in (before, after) if rows.dtype.kind == "f"]
+    coarser = min(floats, key=lambda dtype: dtype.itemsize) if floats else np.result_type(before, after)
+    first, second = after[:-1].astype(coarser), before[1:].astype(coarser)  # equal also where one of them was rounded
+    both_nan = (first != first) & (second != second)
+    misaligned = np.flatnonzero(((first != second) & ~both_nan).any(axis=1))
     if misaligned.size:
         t = misaligned[0]
         raise UserError(f"{where}: row {t} of next_obs/{key} is not row {t + 1} of obs/{key}, the rows are misaligned; {advice}")
@@ -64,6 +73,7 @@ def write_layout(file: h5py.File, recording: Recording) -> None:
         about |= {"hindrl_env": json_attribute(ours), "converted_from": json_attribute(recording.converted_from)}
     data = file.create_group("data")
     data.attrs.update(about | recording.attributes)
+    file.attrs.update(recording.file_attributes)
     file.update(recording.extras)
     for demo in recording.demonstrations:
         group = data.create_group(demo.name)

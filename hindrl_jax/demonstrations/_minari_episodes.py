@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hindrl_jax.base.errors import UserError
+from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.demonstrations.foreign import MINARI_OBSERVATIONS, SOURCE, ForeignDemonstration
 from hindrl_jax.demonstrations.recording import Demonstration, plain
 
@@ -28,45 +28,57 @@ def as_demonstration(source: str, number: int, episode: Any, metadata: dict[str,
       ours: whether we wrote the dataset.
 
     Raises:
-      UserError: its observations, actions or rewards are not finite numbers.
+      UserError: it holds what cannot be kept.
     """
     where = f"{source}: episode {number}"
     leaves = _leaves(episode.observations, "observation")
     length = len(episode.rewards)
-    modalities = {}
-    for key, rows in leaves.items():
-        if not isinstance(rows, np.ndarray) or rows.dtype.kind not in "biuf":
-            raise UserError(f"{where}: observations {key} are not numbers, which is not supported")
-        if rows.ndim <= 2:
-            modalities[key] = rows[:, None] if rows.ndim == 1 else rows
-    for what, rows in {**modalities, "actions": episode.actions, "rewards": episode.rewards}.items():
-        if not np.isfinite(rows).all():
-            raise UserError(f"{where}: {what} is not finite in row {np.argwhere(~np.isfinite(rows))[0][0]}; delete this episode")
+    modalities = {
+        key: rows[:, None] if rows.ndim == 1 else rows
+        for key, rows in leaves.items()
+        if isinstance(rows, np.ndarray) and rows.dtype.kind in "biuf" and 1 <= rows.ndim <= 2
+    }
     infos = _leaves(episode.infos or {}, "")
     states = infos.get("state") if ours else None
     extras: dict[str, np.ndarray] = {}
     if not ours:
         extras = {"actions": episode.actions, "rewards": episode.rewards, _TERMINATIONS: episode.terminations}
-        extras |= {MINARI_OBSERVATIONS + key: rows for key, rows in leaves.items()} | {_INFOS + key: _storable(rows) for key, rows in infos.items()}
+        extras |= {MINARI_OBSERVATIONS + key: _storable(f"{where}: observations {key}", rows) for key, rows in leaves.items()} | {
+            _INFOS + key: _storable(f"{where}: infos {key}", rows) for key, rows in infos.items()
+        }
         if not np.array_equal(episode.truncations, _default_truncations(length, bool(episode.terminations[-1]))):
             extras[_TRUNCATIONS] = episode.truncations
+    dones, problem = _dones(where, episode.terminations, infos)
     return ForeignDemonstration(
         name=f"demo_{number}",
         modalities=modalities,
         actions=episode.actions,
         rewards=episode.rewards,
-        dones=_dones(episode.terminations, infos),
+        dones=dones,
+        problems={} if problem is None else {"dones": problem},
         states=states,
         extras=extras,
         attributes={} if ours else {"minari": json.dumps({key: value for key, value in plain(metadata).items() if key not in _COMPUTED})},
     )
 
 
-def _dones(terminations: np.ndarray, infos: dict[str, Any]) -> np.ndarray:
-    for key in _SUCCESS:
-        if key in infos and np.shape(infos[key]) == (len(terminations) + 1,):
-            return np.asarray(infos[key])[1:].astype(bool)
-    return terminations
+def _dones(where: str, terminations: np.ndarray, infos: dict[str, Any]) -> tuple[np.ndarray, str | None]:
+    """(L,) bool, where the infos say success, if there are such infos, else where the episode terminated; and why they do not say it, if so.
+
+    Infos have a row for each step, or, with that of the reset before them, for each state.
+    """
+    key = next((key for key in _SUCCESS if key in infos), None)
+    if key is None:
+        return terminations, None
+    length, problem = len(terminations), f"{where}: the infos {key} do not say of each of its {len(terminations)} steps whether it solves the task"
+    try:
+        rows = np.asarray(infos[key], np.float64)
+        rows = rows.reshape(len(rows), -1)
+    except (TypeError, ValueError):
+        return np.zeros(length), f"{problem}, since they are not numbers"
+    if len(rows) not in (length, length + 1) or rows.shape[1] != 1 or not np.isfinite(rows).all():
+        return np.zeros(length), f"{problem}, since they are an array of shape {np.shape(infos[key])}"
+    return rows[-length:, 0] > 0.5, None
 
 
 def _leaves(tree: Any, root: str) -> dict[str, Any]:
@@ -79,9 +91,18 @@ def _leaves(tree: Any, root: str) -> dict[str, Any]:
     return found
 
 
-def _storable(rows: Any) -> np.ndarray:
-    """HDF5 has texts as bytes only."""
-    rows = np.asarray(rows)
+def _storable(where: str, rows: Any) -> np.ndarray:
+    """HDF5 has texts as bytes only.
+
+    Raises:
+      UserError: they are no array.
+    """
+    try:
+        rows = np.asarray(rows)
+        if rows.dtype.kind == "O" and not all(isinstance(row, str | bytes) for row in rows.reshape(-1)):
+            raise ValueError("objects of other kinds than texts")
+    except ValueError as error:
+        raise UserError(f"{where} are no array of numbers or texts ({one_line(error)}), and cannot be kept; leave them out of the dataset") from error
     return np.char.encode(rows) if rows.dtype.kind == "U" else rows.astype("S") if rows.dtype.kind == "O" else rows
 
 
@@ -112,7 +133,8 @@ def as_source_episode(demo: Demonstration, observation_space: Any) -> Any:
         if hasattr(space, "spaces"):
             return {key: observations(below, f"{path}/{key}" if path else key) for key, below in space.spaces.items()}
         path = path or "observation"
-        return extras.get(MINARI_OBSERVATIONS + path, observed.get(path))
+        rows = extras.get(MINARI_OBSERVATIONS + path, observed.get(path))
+        return rows.astype(str).tolist() if rows.dtype.kind == "S" else rows
 
     infos: dict[str, Any] = {}
     for key, rows in extras.items():

@@ -55,7 +55,10 @@ def read_header(path: Path, file: h5py.File) -> tuple[Recording, dict[str, int]]
         where = f"{path}: {name}"
         if not isinstance(data[name], h5py.Group):
             raise UserError(f"{where}: is not a group; {RECORD_AGAIN}")
-        lengths[name] = int(_attribute(where, data[name], "num_samples"))
+        number = np.asarray(_attribute(where, data[name], "num_samples"))
+        if number.size != 1 or number.dtype.kind not in "iuf" or number.reshape(()) % 1 != 0:
+            raise UserError(f"{where}: attribute num_samples is no whole number; {RECORD_AGAIN}")
+        lengths[name] = int(number.reshape(()))
         if lengths[name] < 1:
             raise UserError(f"{where}: has {lengths[name]} transitions, at least 1 is needed; delete this demonstration or {RECORD_AGAIN}")
     return Recording(env_name=env_name, env_kwargs=env_kwargs, expert=expert, demonstrations=(), converted_from=converted_from), lengths
@@ -106,6 +109,7 @@ def with_extras(path: Path, file: h5py.File, recording: Recording) -> Recording:
         recording,
         demonstrations=tuple(_with_extras(f"{path}: {demo.name}", file["data"][demo.name], demo) for demo in recording.demonstrations),
         extras=datasets_beside(file, "data"),
+        file_attributes=dict(file.attrs),
         attributes={name: about[name] for name in kept if name in about},
     )
 

@@ -89,6 +89,8 @@ def _check_alike(foreign: ForeignRecording, selection: Selection) -> None:
         if len(demo.actions) < 1:
             raise UserError(f"{where}: has no actions; delete this demonstration")
         for key in used:
+            if key in demo.problems:
+                raise UserError(demo.problems[key])
             if key not in demo.modalities or demo.modalities[key].shape[1] != foreign.shapes[key]:
                 found = demo.modalities[key].shape[1] if key in demo.modalities else "no"
                 raise UserError(f"{where}: has {found} columns of {key}, but {demos[0].name} has {foreign.shapes[key]}; delete one of them")

@@ -106,6 +106,25 @@ def check_lengths(path: Path, lengths: Sequence[int], horizon: int, num_demos: i
         warnings.warn(message, stacklevel=3)
 
 
+def _say_what_is_out_of_bounds(path: Path, demos: Sequence[Demonstration], env: Environment) -> None:
+    """Warns of observations that the environment itself never gives, if it says what it gives."""
+    low, high = getattr(env, "observation_low", None), getattr(env, "observation_high", None)
+    if low is None or high is None:
+        return
+    for demo in demos:
+        room = _GOAL_TOLERANCE * (1.0 + np.abs(demo.observations))  # for rounding
+        outside = (demo.observations < low - room) | (demo.observations > high + room)
+        if outside.any():
+            row, dim = np.argwhere(outside)[0]
+            low, high = (float(np.broadcast_to(bound, outside.shape[1])[dim]) for bound in (low, high))
+            warnings.warn(
+                f"{path}: {demo.name}: observation[{dim}] = {demo.observations[row, dim]:g} in row {row} lies outside the bounds of {env.name}, "
+                f"{low:g} to {high:g}: is it of this environment?",
+                stacklevel=4,
+            )
+            return
+
+
 def check_against_env(path: Path, recording: Recording, env: Environment) -> None:
     """Refuses a recording of another environment, of other arguments or dimensions, or with goals that the environment does not derive."""
     env_name, env_kwargs, demos = recording.env_name, recording.env_kwargs, recording.demonstrations
@@ -126,6 +145,7 @@ def check_against_env(path: Path, recording: Recording, env: Environment) -> Non
             if getattr(demo, what) is not None and getattr(demo, what).shape[1] != dim:
                 found, what = getattr(demo, what).shape[1], what.replace("_", " ")
                 raise UserError(f"{path}: {demo.name}: {what} have {found} dimensions, but {dim} in {env.name}; {RECORD_AGAIN}")
+    _say_what_is_out_of_bounds(path, demos, env)
     # One call for the whole file: under JAX, one per demonstration would compile for every length.
     owners = np.repeat(np.arange(len(demos)), [len(demo.observations) for demo in demos])
     observations: Any = np.concatenate([demo.observations for demo in demos])

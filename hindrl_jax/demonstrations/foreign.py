@@ -66,6 +66,8 @@ class ForeignDemonstration:
     """(L + 1, S), or (L, S) where the last is not known; only of use if they are those of our own environment."""
     extras: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
     """All datasets that our file is to keep, by the name that they have there."""
+    problems: dict[str, str] = dataclasses.field(default_factory=dict)
+    """What is wrong with a modality, or with `dones`; said where it is to be used."""
     attributes: dict[str, Any] = dataclasses.field(default_factory=dict)
 
 
@@ -88,6 +90,7 @@ class ForeignRecording:
     """Names of the demonstrations that belong to each filter key."""
     extras: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
     attributes: dict[str, Any] = dataclasses.field(default_factory=dict)
+    file_attributes: dict[str, Any] = dataclasses.field(default_factory=dict)
     ours: bool = False
     """Whether we have written it, so that a conversion back gives a file as if it had been recorded."""
     about: dict[str, Any] = dataclasses.field(default_factory=dict)

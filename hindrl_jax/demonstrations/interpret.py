@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -52,6 +53,7 @@ def interpret(foreign: ForeignRecording, meaning: Interpretation, env: Environme
         converted_from=None if as_recorded else _converted_from(foreign, meaning),
         extras=foreign.extras,
         attributes=foreign.attributes,
+        file_attributes=foreign.file_attributes,
     )
 
 
@@ -71,9 +73,14 @@ def _filtered(foreign: ForeignRecording, filter_key: str | None) -> Sequence[For
     if filter_key not in foreign.filters:
         there = f"it has {', '.join(foreign.filters)}" if foreign.filters else "it has none"
         raise UserError(f"{foreign.source}: no filter key {filter_key!r}; {there}")
-    chosen = [demo for demo in foreign.demonstrations if demo.name in foreign.filters[filter_key]]
+    named = dict.fromkeys(foreign.filters[filter_key])
+    chosen = [demo for demo in foreign.demonstrations if demo.name in named]
     if not chosen:
         raise UserError(f"{foreign.source}: filter key {filter_key!r} names no demonstration of the file; choose another")
+    missing = [name for name in named if name not in {demo.name for demo in chosen}]
+    if missing:
+        more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
+        warnings.warn(f"{foreign.source}: filter key {filter_key!r} names {', '.join(missing[:3])}{more}, which the file does not hold", stacklevel=2)
     return chosen
 
 
@@ -87,6 +94,10 @@ def _interpret_one(
     end, rewards = len(demo.actions), demo.rewards
     if meaning.sparse_rewards or rewards is None:
         rewards = (np.arange(end) == end - 1).astype(np.float32) * np.float32(solved)
+    for key in selection.used:
+        _check_finite(where, key, demo.modalities[key], "name others with --observation-keys, or delete this demonstration")
+    _check_finite(where, "actions", demo.actions, "delete this demonstration")
+    _check_finite(where, "rewards", rewards, "put others in their place with --sparse-rewards, or delete this demonstration")
     observations, actions = joined_columns(demo, selection.observation), _policy_actions(where, foreign, demo.actions, meaning)
     achieved, desired = np.zeros((end + 1, 0), np.float32), np.zeros(0, np.float32)
     if selection.achieved_goal:
@@ -109,6 +120,12 @@ def _interpret_one(
         extras=demo.extras,
         attributes=demo.attributes,
     )
+
+
+def _check_finite(where: str, name: str, rows: np.ndarray, advice: str) -> None:
+    """Of the steps that are kept; what is cut off or not used may be anything."""
+    if not np.isfinite(rows).all():
+        raise UserError(f"{where}: {name} is not finite in row {np.argwhere(~np.isfinite(rows))[0][0]}; {advice}")
 
 
 def _with_goals(demo: Demonstration, reached: np.ndarray) -> Demonstration:
@@ -136,12 +153,14 @@ def _policy_actions(where: str, foreign: ForeignRecording, actions: np.ndarray, 
         _bound(where, given, known, actions.shape[1], default)
         for given, known, default in ((meaning.action_low, foreign.action_low, -1.0), (meaning.action_high, foreign.action_high, 1.0))
     )
-    if (low >= high).any():
+    fixed = low == high
+    if (low > high).any() or (fixed.any() and (meaning.action_low or meaning.action_high)):
         raise UserError(f"{where}: the lowest action must be below the highest; correct --action-low and --action-high")
     if (low == -1.0).all() and (high == 1.0).all():
         mapped = actions
     else:
-        mapped = (2.0 * (actions.astype(np.float64) - low) / (high - low) - 1.0).astype(np.float32)
+        mapped = 2.0 * (actions.astype(np.float64) - low) / np.where(fixed, 1.0, high - low) - 1.0
+        mapped = np.where(fixed, np.where(np.isclose(actions, low), 0.0, np.inf), mapped).astype(np.float32)
     largest = np.abs(mapped).max(initial=0.0)
     if not largest <= 1.0 + _ACTION_TOLERANCE:
         dims = np.flatnonzero((np.abs(mapped) > 1.0 + _ACTION_TOLERANCE).any(axis=0)).tolist()

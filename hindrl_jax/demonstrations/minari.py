@@ -33,7 +33,8 @@ from hindrl_jax.base.files import check_free
 from hindrl_jax.demonstrations._minari_episodes import as_demonstration, as_episode, as_source_episode, source_metadata
 from hindrl_jax.demonstrations.foreign import ForeignRecording
 from hindrl_jax.demonstrations.recording import Recording, plain
-from hindrl_jax.tasks.registry import TASKS
+from hindrl_jax.tasks.registry import TASKS, make
+from hindrl_jax.tasks.simulators import action_bounds
 
 PREFIX = "minari:"
 GYMNASIUM = "gymnasium:"  # begins the names of environments that are not ours
@@ -115,7 +116,9 @@ def _environment(spec: Any, ours: dict[str, Any] | None) -> tuple[str, dict[str,
 def _bounds(source: str, space: Any) -> tuple[np.ndarray, np.ndarray]:
     if not (hasattr(space, "low") and len(space.shape) == 1):
         raise UserError(f"{source}: its actions are {space}; only vectors of real numbers are supported")
-    return space.low, space.high
+    if space.dtype.kind == "f":
+        return space.low, space.high  # perhaps without bounds, which the user may then give
+    return action_bounds(source, space)
 
 
 def check_writable(name: str, *, overwrite: bool) -> None:
@@ -239,11 +242,32 @@ def _spaces(recording: Recording) -> dict[str, Any]:
     from gymnasium import spaces
 
     first = recording.demonstrations[0]
+    low, high = _observation_bounds(recording)
     goals: dict[str, spaces.Space[Any]] = {
-        key: spaces.Box(-np.inf, np.inf, rows.shape[1:], rows.dtype.type if rows.dtype.kind == "f" else np.float32)
+        key: spaces.Box(low[key], high[key], rows.shape[1:], rows.dtype.type if rows.dtype.kind == "f" else np.float32)
         for key, rows in first.observed.items()
     }
     return {"observation_space": spaces.Dict(goals), "action_space": spaces.Box(-1.0, 1.0, first.actions.shape[1:], np.float32)}
+
+
+def _observation_bounds(recording: Recording) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The bounds of what is observed, by its name: the environment's own, where it is one of ours and the recording keeps to them."""
+    observed = recording.demonstrations[0].observed
+    low, high = {key: -np.inf for key in observed}, {key: np.inf for key in observed}
+    if recording.env_name not in TASKS:
+        return low, high
+    env: Any = make(recording.env_name, **recording.env_kwargs)
+    if hasattr(env, "observation_low"):
+        bounds = [
+            {"observation": bound} | dict.fromkeys(("achieved_goal", "desired_goal"), np.asarray(env.achieved_goal(bound)))
+            for bound in (env.observation_low, env.observation_high)
+        ]
+        inside = all(
+            ((rows >= bounds[0][key]) & (rows <= bounds[1][key])).all() for demo in recording.demonstrations for key, rows in demo.observed.items()
+        )
+        if inside:
+            return bounds[0], bounds[1]
+    return low, high
 
 
 def left_out(recording: Recording) -> list[str]:

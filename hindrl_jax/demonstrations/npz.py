@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from hindrl_jax.base.checks import LARGEST
 from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.base.files import DAMAGED_ARCHIVE, check_is_file, read_arrays
 from hindrl_jax.demonstrations.foreign import ForeignDemonstration, ForeignRecording
@@ -53,6 +54,7 @@ def content(recording: Recording) -> bytes:
         "converted_from": recording.converted_from,
         "names": [demo.name for demo in demos],
         "attributes": _plain_attributes(recording.attributes),
+        "file_attributes": _plain_attributes(recording.file_attributes),
         "demonstration_attributes": [_plain_attributes(demo.attributes) for demo in demos],
     }
     arrays["about"] = np.array(json.dumps(about))
@@ -89,6 +91,9 @@ def read(path: Path) -> ForeignRecording | Recording:
     lengths = arrays["lengths"]
     if lengths.ndim != 1 or lengths.dtype.kind not in "iu" or not lengths.size or lengths.min() < 1:
         raise UserError(f"{path}: lengths must be whole numbers (N,) of at least 1, one for each demonstration; write it again")
+    lengths = arrays["lengths"] = lengths.astype(np.int64)  # in a narrow type, sums would begin anew
+    if lengths.min() < 1 or int(lengths.max()) > LARGEST:
+        raise UserError(f"{path}: lengths reach {lengths.max()}, which is more than an archive holds; write it again")
     after, before = np.cumsum(lengths + 1)[:-1], np.cumsum(lengths)[:-1]
     totals = {"observations": (after, 1), "achieved_goals": (after, 1), "states": (after, 1), "actions": (before, 0), "rewards": (before, 0)}
     split = {}
@@ -114,7 +119,7 @@ def read(path: Path) -> ForeignRecording | Recording:
 def _about(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
     try:
         about = json.loads(str(arrays.pop("about", "{}")))
-    except (json.JSONDecodeError, RecursionError):
+    except (ValueError, RecursionError):
         about = None
     if not isinstance(about, dict):
         raise UserError(f"{path}: the array about is not the text of a JSON object; write it again, or leave it out")
@@ -131,7 +136,7 @@ def _check(path: Path, name: str, array: np.ndarray, num_rows: int, dims: int) -
     if array.ndim != dims or len(array) != num_rows:
         wanted = f"({num_rows},)" if dims == 1 else f"({num_rows}, any)"
         raise UserError(f"{path}: {name} has shape {array.shape}, expected {wanted} by its lengths; write it again")
-    if array.dtype.kind not in "biuf" or not np.isfinite(array).all():
+    if array.dtype.kind not in "biuf" or (name in ("desired_goals", "terminated") and not np.isfinite(array).all()):
         raise UserError(f"{path}: {name} does not hold finite numbers only; write it again")
 
 
@@ -158,8 +163,9 @@ def _recording(arrays: dict[str, np.ndarray], split: dict[str, list[np.ndarray]]
         expert=about["expert"],
         demonstrations=demos,
         converted_from=about["converted_from"],
-        extras={name: array for name, array in extras.items() if not name.startswith("data/")},
+        extras={name: array for name, array in extras.items() if not name.startswith(tuple(f"data/{demo}/" for demo in names))},
         attributes=about["attributes"],
+        file_attributes=about.get("file_attributes", {}),
     )
 
 

@@ -59,6 +59,8 @@ class Recording:
     """Datasets outside the group `data`, by their path in the file."""
     attributes: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Attributes of the source's group `data`; its env_args and env stand in the file in place of ours."""
+    file_attributes: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Attributes of the file as a whole."""
 
 
 @dataclasses.dataclass(frozen=True)

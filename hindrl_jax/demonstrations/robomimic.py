@@ -45,18 +45,26 @@ def read(path: Path) -> ForeignRecording:
         if not names:
             raise UserError(f"{path}: holds no demonstrations; name another file")
         attributes = {name: value for name, value in data.attrs.items() if name != "total"}
-        extras = datasets_beside(file, "data")
+        texts: set[str] = set()
+        extras = datasets_beside(file, "data", texts)
         env_args = _env_args(path, attributes)
         return ForeignRecording(
             source=f"{path}",
             format="robomimic",
             env_name=str(env_args["env_name"]),
             env_kwargs=env_args.get("env_kwargs") or {},
-            demonstrations=tuple(_read_demonstration(f"{path}: {name}", name, data[name]) for name in names),
-            filters={name.removeprefix("mask/"): array.astype(str).tolist() for name, array in extras.items() if name.startswith("mask/")},
+            demonstrations=tuple(_read_demonstration(f"{path}: {name}", name, data[name], texts) for name in names),
+            filters={name.removeprefix("mask/"): _names(array) for name, array in extras.items() if name.startswith("mask/")},
             extras=extras,
             attributes=attributes,
+            file_attributes=dict(file.attrs),
+            about={"texts": sorted(texts)} if texts else {},
         )
+
+
+def _names(mask: np.ndarray) -> list[str]:
+    """The names of demonstrations that a filter key lists."""
+    return [name.decode(errors="replace") if isinstance(name, bytes) else str(name) for name in mask.reshape(-1).tolist()]
 
 
 def _env_args(path: Path, attributes: dict[str, Any]) -> dict[str, Any]:
@@ -73,16 +81,21 @@ def _env_args(path: Path, attributes: dict[str, Any]) -> dict[str, Any]:
     return {"env_name": name.decode() if isinstance(name, bytes) else str(name)}
 
 
-def _read_demonstration(where: str, name: str, group: h5py.Group) -> ForeignDemonstration:
-    datasets = datasets_within(group)
+def _read_demonstration(where: str, name: str, group: h5py.Group, texts: set[str]) -> ForeignDemonstration:
+    texts_here: set[str] = set()
+    datasets = datasets_within(group, texts=texts_here)
+    texts.update(f"data/{name}/{path}" for path in texts_here)
     if "actions" not in datasets:
         raise UserError(f"{where}: dataset actions is missing; the file is damaged or no file of demonstrations")
     actions = _numbers(where, "actions", datasets["actions"], dims=2)
-    modalities = {}
+    modalities, problems = {}, {}
     for path, rows in datasets.items():
-        if path.startswith("obs/") and rows.ndim <= _MAX_MODALITY_DIMS and rows.dtype.kind in "biuf":
+        if path.startswith("obs/") and 1 <= rows.ndim <= _MAX_MODALITY_DIMS and rows.dtype.kind in "biuf":
             key = path.removeprefix("obs/")
-            modalities[key] = _rows(where, key, rows, datasets.get(f"next_obs/{key}"))
+            try:
+                modalities[key] = _rows(where, key, rows, datasets.get(f"next_obs/{key}"))
+            except UserError as error:
+                modalities[key], problems[key] = _as_columns(rows), str(error)
     along = {key: _numbers(where, key, datasets[key], dims=1) if key in datasets else None for key in ("rewards", "dones")}
     return ForeignDemonstration(
         name=name,
@@ -91,6 +104,7 @@ def _read_demonstration(where: str, name: str, group: h5py.Group) -> ForeignDemo
         **along,
         states=datasets.get("states"),
         extras=datasets,
+        problems=problems,
         attributes={name: value for name, value in group.attrs.items() if name != "num_samples"},
     )
 
@@ -103,7 +117,7 @@ def _rows(where: str, key: str, before: np.ndarray, after: np.ndarray | None) ->
     after = _numbers(where, f"next_obs/{key}", after)
     if after.shape != before.shape:
         raise UserError(f"{where}: obs/{key} has shape {before.shape}, but next_obs/{key} {after.shape}; write the file again")
-    return joined(where, key, _as_columns(before), _as_columns(after), advice="write the file again")
+    return joined(where, key, _as_columns(before), _as_columns(after), advice="write the file again, or name others with --observation-keys")
 
 
 def _as_columns(rows: np.ndarray) -> np.ndarray:
@@ -115,9 +129,6 @@ def _numbers(where: str, name: str, array: np.ndarray, *, dims: int | None = Non
         raise UserError(f"{where}: {name} has shape {array.shape}, expected {dims} dimension{'s' if dims > 1 else ''}; write the file again")
     if array.dtype.kind not in "biuf":
         raise UserError(f"{where}: {name} holds {array.dtype}, not numbers; write the file again")
-    if not np.isfinite(array).all():
-        row = np.argwhere(~np.isfinite(array))[0][0]
-        raise UserError(f"{where}: {name} is not finite in row {row}; delete this demonstration")
     return array[:, 0] if dims == 1 and array.ndim == 2 else array
 
 
@@ -133,13 +144,21 @@ def restored(recording: Recording, where: str) -> bytes:
     if source.get("format") != "robomimic":
         raise UserError(f"{where}: was not converted from a robomimic file, so there is none to give back; convert without --restore")
 
+    texts = set(source.get("texts", ()))
+
+    def as_it_was(prefix: str, datasets: dict[str, np.ndarray]) -> dict[str, Any]:
+        """Texts of variable length are such again."""
+        text = h5py.string_dtype()
+        return {name: rows.astype(object).astype(text) if prefix + name in texts else rows for name, rows in datasets.items()}
+
     def write(file: h5py.File) -> None:
         data = file.create_group("data")
         data.attrs.update(recording.attributes | {"total": sum(map(len, recording.demonstrations))})
-        file.update(recording.extras)
+        file.attrs.update(recording.file_attributes)
+        file.update(as_it_was("", recording.extras))
         for demo in recording.demonstrations:
             group = data.create_group(demo.name)
-            group.update(_source_datasets(demo, source["datasets"]))
+            group.update(as_it_was(f"data/{demo.name}/", _source_datasets(demo, source["datasets"])))
             group.attrs.update({"num_samples": len(demo)} | demo.attributes)
 
     return hdf5_bytes(write).getvalue()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ def check_film(path: Path, num_episodes: int = 1) -> None:
         raise UserError(f"cannot draw {path.name}: the name must end in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
     if path.suffix == ".png" and num_episodes > 1:
         raise UserError(f"cannot draw {num_episodes} episodes into {path.name}, which holds the last state of one: write a .gif or .mp4")
-    if not path.parent.is_dir():
+    if not os.path.isdir(path.parent):
         raise UserError(f"cannot write {path}: there is no folder {path.parent}; make it first")
     if path.suffix == ".mp4":
         require("av.container", "write a .gif")

@@ -15,8 +15,10 @@ import dataclasses
 import io
 import logging
 import os
+import re
 import shutil
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -84,9 +86,10 @@ class Checkpoints:
         path = self.folder / str(result.steps_done)
         with self._disk_trouble():
             # The keeper of checkpoints would wait for other hosts and threads; one file after the other is all that is needed here.
-            with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with _plainly_named(path) as named, ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
                 items = {"arrays": ocp.args.StandardSave(arrays), "progress": ocp.args.JsonSave(progress)}
-                checkpointer.save(path, args=ocp.args.Composite(**items), force=True)
+                checkpointer.save(named, args=ocp.args.Composite(**items), force=True)
             self._remove_folders(but=path)
         self.steps, self._saved_at = result.steps_done, time.monotonic()
 
@@ -102,14 +105,16 @@ class Checkpoints:
         ocp, path = _orbax(), complete[-1]
         shapes = _leaves(begun)
         target = {name: _plain_shape(leaf) for name, leaf in shapes.items()}
-        with self._damage(path), ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
-            progress = checkpointer.restore(path, args=ocp.args.Composite(progress=ocp.args.JsonRestore())).progress
+        with self._damage(path), _plainly_named(path) as named, ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
+            progress = checkpointer.restore(named, args=ocp.args.Composite(progress=ocp.args.JsonRestore())).progress
             layout, found = progress["layout"], dict(progress["shapes"])
         if layout != LAYOUT:
             raise UserError(f"{path} has layout {layout}, and this version of hindrl_jax reads {LAYOUT}: go on with the version that wrote it")
         _check_shapes(path, found, _shapes(target))
-        with self._damage(path), ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
-            arrays = checkpointer.restore(path, args=ocp.args.Composite(arrays=ocp.args.StandardRestore(target))).arrays
+        if not all(isinstance(progress[name], int | float) for name in _COUNTERS):
+            raise UserError(f"{path} is damaged (its counters are no numbers): remove it to begin again")
+        with self._damage(path), _plainly_named(path) as named, ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as checkpointer:
+            arrays = checkpointer.restore(named, args=ocp.args.Composite(arrays=ocp.args.StandardRestore(target))).arrays
             leaves = [_as(shapes[name], arrays[name]) for name in shapes]
             guidance, state, key, kept = jax.tree.unflatten(jax.tree.structure(_trees(begun)), leaves)
             restored = dataclasses.replace(
@@ -159,9 +164,9 @@ class Checkpoints:
             known = {field.name for field in dataclasses.fields(Episodes)}
             fields: dict[str, Any] = {name: array for name, array in read_arrays(path).items() if name in known}
             stacked = Episodes(**fields)
-        except DAMAGED_ARCHIVE as error:
+            return [stacked.replace(**{name: leaf[i] for name, leaf in fields.items()}) for i in range(len(stacked.lengths))]
+        except (*DAMAGED_ARCHIVE, IndexError) as error:
             raise UserError(f"{path} is damaged ({one_line(error)}): train again") from error
-        return [stacked.replace(**{name: leaf[i] for name, leaf in fields.items()}) for i in range(len(stacked.lengths))]
 
     def _remove_folders(self, *, but: Path | None) -> None:
         """Removes older checkpoints and what was not finished."""
@@ -190,8 +195,25 @@ class Checkpoints:
         try:
             with _unheard_when_late():
                 yield
-        except (OSError, ValueError, KeyError, TypeError) as error:  # what libraries say of bytes that make no sense
+        except UserError:
+            raise
+        except Exception as error:  # what libraries say of bytes that make no sense
             raise UserError(f"{path} is damaged ({one_line(error)[:200]}): remove it to begin again") from error
+
+
+@contextlib.contextmanager
+def _plainly_named(path: Path) -> Iterator[Path]:
+    """A path within a folder that exists, if need be by another way, since Orbax takes brackets and asterisks in it for patterns.
+
+    It would then write checkpoints that cannot be read, and say nothing.
+    """
+    if re.fullmatch(r"[\w/.,=+-]{1,500}", str(path), re.ASCII):
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="hindrl_") as place:
+        link = Path(place) / "folder"
+        link.symlink_to(path.parent, target_is_directory=True)
+        yield link / path.name
 
 
 def _remove_folder(path: Path, *, patience: float = 5.0) -> None:

@@ -4,24 +4,28 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax.traverse_util import unflatten_dict
 
+from hindrl_jax.base.compilation import in_float32
 from hindrl_jax.base.environments import Environment, Restorable
 from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.base.files import DAMAGED_ARCHIVE, disk_trouble, read_arrays
 from hindrl_jax.base.steppers import Watchable
 from hindrl_jax.base.types import Episodes
-from hindrl_jax.core.agent import Policy
+from hindrl_jax.core.agent import Policy, init, policy
 from hindrl_jax.core.goals import GoalTable
+from hindrl_jax.core.holding import hold
 from hindrl_jax.core.inputs import InputScale
 from hindrl_jax.plotting.films import check_film, save_film, save_pictures
-from hindrl_jax.runs.spec import PARAMETERS, RunSpec, read_spec
+from hindrl_jax.runs.spec import CONFIG, PARAMETERS, RunSpec, read_spec
 from hindrl_jax.tasks.registry import checked
 from hindrl_jax.training.playing import TrainedPolicies
 
@@ -48,6 +52,7 @@ class Run:
             raise UserError(f"{env.name} has one back end only: drop the choice of {backend!r}")
         return dataclasses.replace(self, spec=dataclasses.replace(self.spec, env=checked(lambda: dataclasses.replace(env, backend=backend))))
 
+    @in_float32
     def evaluate(
         self,
         *,
@@ -71,6 +76,7 @@ class Run:
             for i, seed in enumerate(self.spec.seeds)
         ]
 
+    @in_float32
     def render(self, path: Path, *, seed: int | None = None, key: jax.Array | None = None, noise: float | None = None) -> int:
         """Films fresh episodes of one seed's policy (the first seed's by default); returns how many of them solved the task.
 
@@ -98,6 +104,7 @@ class Run:
         draw_episodes(path, env, [episodes.states[0, : int(episodes.lengths[0]) + 1] for episodes in played])
         return sum(bool(episodes.terminated[0]) for episodes in played)
 
+    @in_float32
     def play(self, episodes: int = 1, *, seed: int | None = None, key: jax.Array | None = None, noise: float | None = None) -> Episodes:
         """Plays fresh episodes with one seed's policy (the first seed's by default), to be looked at step by step; solved or not.
 
@@ -118,6 +125,8 @@ class Run:
         return self._trained(noise).play(jax.random.key(0) if key is None else key, self._index_of(seed), episodes)
 
     def _trained(self, noise: float | None) -> TrainedPolicies:
+        if noise is not None and not 0.0 <= noise < float("inf"):
+            raise UserError(f"noise = {noise} is not usable: give 0 for the mean actions, 1 for sampled ones, or another finite number above 0")
         policies = self.policies if noise is None else self.policies.replace(noise=jnp.full_like(self.policies.noise, noise))
         return TrainedPolicies(self.spec.env, self.spec.config, policies, self.behavioural_goals)
 
@@ -129,6 +138,7 @@ class Run:
         return self.spec.seeds.index(seed)
 
 
+@in_float32
 def draw_episodes(path: Path, env: Environment, episodes: Sequence[np.ndarray]) -> None:
     """Draws episodes from their states (length + 1, S each): a film of them, one after the other, or as a PNG the last state.
 
@@ -147,6 +157,7 @@ def draw_episodes(path: Path, env: Environment, episodes: Sequence[np.ndarray]) 
         save_film(env, unpacked, path)
 
 
+@in_float32
 def load_run(path: str | os.PathLike[str], *, last: bool = False) -> Run:
     """Reads a run's directory.
 
@@ -161,7 +172,7 @@ def load_run(path: str | os.PathLike[str], *, last: bool = False) -> Run:
     spec = read_spec(path)
     file = path / PARAMETERS
     if not file.exists():
-        raise UserError(f"{path} holds no {PARAMETERS}: the run did not finish; go on with it by `hindrl train --resume {path}`")
+        raise UserError(f"{path} holds no {PARAMETERS}: the run did not finish; go on with it by `hindrl train --resume {shlex.quote(str(path))}`")
     try:
         tree = unflatten_dict({name: jnp.asarray(array) for name, array in read_arrays(file).items()}, sep="/")
         goals = GoalTable(goals=tree["behavioural_goals"]["goals"], count=tree["behavioural_goals"]["count"])
@@ -170,9 +181,57 @@ def load_run(path: str | os.PathLike[str], *, last: bool = False) -> Run:
         mean_actions = jnp.zeros(len(spec.seeds))
         noise = mean_actions if last else tree.get("policy_noise", mean_actions)
         policies = Policy(actor=actor, scale=_input_scale(tree["input_scale"]), noise=noise)
-    except DAMAGED_ARCHIVE as error:
+    except (*DAMAGED_ARCHIVE, AttributeError, IndexError) as error:
         raise UserError(f"{file} is damaged ({one_line(error)}): train again") from error
+    _check_parameters(file, spec, (policies, goals))
     return Run(path=path, spec=spec, policies=policies, behavioural_goals=goals)
+
+
+class _Shape(tuple[int | None, ...]):
+    """A shape as a leaf of a tree; None where any number will do."""
+
+
+def _check_parameters(file: Path, spec: RunSpec, found: tuple[Policy, GoalTable]) -> None:
+    """Makes sure that the parameters are those of the configuration, and numbers.
+
+    Raises:
+      UserError: naming the first array that is not.
+    """
+    expected = jax.tree_util.tree_leaves_with_path(_shapes_of(spec), is_leaf=lambda leaf: type(leaf) is _Shape)
+    arrays = {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(found)}
+    for path, shape in expected:
+        name = jax.tree_util.keystr(path)
+        array = arrays.pop(name, None)
+        wanted = tuple(there if known is None else known for known, there in zip(shape, getattr(array, "shape", shape), strict=False))
+        if array is None or array.shape != wanted or len(wanted) != len(shape):
+            there = "none" if array is None else f"one of shape {array.shape}"
+            raise UserError(
+                f"{file} does not fit {CONFIG} beside it: that asks for an array {tuple('any' if n is None else n for n in shape)} in {name}, and "
+                f"there is {there}; put back the {CONFIG} of the run, or train again"
+            )
+        real = jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)
+        if not real or not bool(jnp.isfinite(array).all()):
+            raise UserError(f"{file} holds what is no finite number in {name}, so its policies cannot be played: train again")
+    if arrays:
+        raise UserError(f"{file} does not fit {CONFIG} beside it: that asks for no array in {next(iter(arrays))}; put back the {CONFIG} of the run")
+    count, num_goals = found[1].count, found[1].goals.shape[1]
+    if not bool(((count >= 1) & (count <= num_goals)).all()):
+        raise UserError(f"{file} is damaged (it counts {count.tolist()} of {num_goals} behavioural goals): train again")
+
+
+def _shapes_of(spec: RunSpec) -> tuple[Policy, GoalTable]:
+    """The shapes of a run's policies and behavioural goals, leaves tuples (S, ...); None where any number will do."""
+    num_seeds, env = len(spec.seeds), hold(spec.env, spec.config.num_held, chunks=spec.config.action_chunks)
+    dims = dict(observation=env.observation_dim, goal=env.goal_dim, observation_centre=env.observation_dim, goal_centre=env.goal_dim)
+    vectors: dict[str, Any] = {name: jax.ShapeDtypeStruct((dim,), jnp.float32) for name, dim in dims.items()}
+
+    def fresh(key: jax.Array, scale: InputScale) -> Policy:
+        return policy(init(key, scale, spec.config, action_dim=env.action_dim), average=True)
+
+    of_one = jax.eval_shape(fresh, jax.random.key(0), InputScale(**vectors))
+    policies = jax.tree.map(lambda leaf: _Shape((num_seeds, *leaf.shape)), of_one)
+    table: dict[str, Any] = dict(goals=_Shape((num_seeds, None, env.goal_dim)), count=_Shape((num_seeds,)))
+    return policies, GoalTable(**table)
 
 
 def _input_scale(saved: dict[str, jax.Array]) -> InputScale:

@@ -66,10 +66,15 @@ def read_recorded(path: Path, label: str | None = None) -> RecordedRun:
         summary = json.loads((path / SUMMARY).read_text()) if (path / SUMMARY).exists() else None
         columns = _whole_evaluations(text, spec.seeds)
         final = None if summary is None else np.asarray([float(seed["returned_success"]) for seed in summary["seeds"]])
+        if final is not None and final.shape != (len(spec.seeds),):
+            raise ValueError(f"{SUMMARY} is of {len(final)} seeds, and {len(spec.seeds)} were asked for")
+        for name, shares in ((METRICS, columns["success"]), (SUMMARY, np.zeros(0) if final is None else final)):
+            if not ((shares >= 0.0) & (shares <= 1.0)).all():
+                raise ValueError(f"a success in {name} is no share from 0 to 1")
         total = None if summary is None else float(summary["train_seconds"])
     except FileNotFoundError:
         raise UserError(f"{path} has no {METRICS} yet: wait for its first evaluation, or leave it out") from None
-    except (OSError, ValueError, LookupError, TypeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"{path} is damaged ({one_line(error)}): leave it out, or remove it and train again") from error
     if not len(columns["success"]):
         raise UserError(f"{path} has no evaluation of all its seeds yet: wait for the first, or leave it out")

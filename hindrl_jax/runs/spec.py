@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -67,14 +68,17 @@ class RunSpec:
             if name not in data:
                 raise UserError(f"{where} lacks {name!r}: use a config.json that `hindrl train` wrote")
         seeds, env_args = data["seeds"], data["env_args"]
+        for name in ("env", "demos"):
+            if not isinstance(data[name], str):
+                raise UserError(f"{where}: {name} = {data[name]!r} is not usable: it must be a text")
         if not isinstance(env_args, dict):
             raise UserError(f"{where}: env_args = {env_args!r} is not usable: it must be an object of the environment's arguments")
         if not (isinstance(seeds, list) and seeds and all(type(seed) is int and 0 <= seed < 2**32 for seed in seeds)):
             raise UserError(f"{where}: seeds = {seeds!r} is not usable: it must be a list of whole numbers from 0 to {2**32 - 1}")
         return RunSpec(
-            env=make(str(data["env"]), **env_args),
+            env=make(data["env"], **env_args),
             config=_config_from_dict(TrainConfig, data["config"], "config", where),
-            demos=str(data["demos"]),
+            demos=data["demos"],
             seeds=tuple(seeds),
         )
 
@@ -85,12 +89,12 @@ def read_spec(path: Path) -> RunSpec:
     Raises:
       UserError: if it is not there or not usable.
     """
-    path = path / CONFIG if path.is_dir() else path
+    path = path / CONFIG if os.path.isdir(path) else path
+    if not os.path.exists(path):
+        raise UserError(f"{path} does not exist: give the directory of a run, or its {CONFIG}")
     try:
         data = json.loads(path.read_text())
-    except FileNotFoundError:
-        raise UserError(f"{path} does not exist: give the directory of a run, or its {CONFIG}") from None
-    except (OSError, UnicodeDecodeError, ValueError) as error:
+    except (OSError, UnicodeDecodeError, ValueError, RecursionError) as error:
         raise UserError(f"{path} cannot be read as JSON ({one_line(error)}): use a {CONFIG} that `hindrl train` wrote") from error
     return RunSpec.from_json(data, path)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -46,7 +47,7 @@ class SweepWriter:
           UserError: if the path holds something else, or a sweep and neither `overwrite` nor `resume` is on, or cannot be written.
         """
         self.path, self.settings, self.resume = path, settings, resume
-        there = [name for name in (*RUN_FILES, SWEEP_SETTINGS, SWEEP, SWEEP_CURVES) if (path / name).exists()]
+        there = [name for name in (*RUN_FILES, SWEEP_SETTINGS, SWEEP, SWEEP_CURVES) if os.path.exists(path / name)]
         if there and not ((overwrite or resume) and SWEEP_SETTINGS in there):
             raise UserError(f"{path} already holds {', '.join(there)}: choose another --out, or replace a sweep with --overwrite")
         specs = [dataclasses.replace(spec, config=with_values(spec.config, setting)) for setting in settings]
@@ -129,6 +130,6 @@ def read_sweep(path: Path) -> tuple[RunSpec, list[dict[str, float]]]:
             with_values(spec.config, setting)
     except UserError:
         raise
-    except (OSError, UnicodeDecodeError, ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
+    except (OSError, UnicodeDecodeError, ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"{file} does not tell the settings of a sweep ({one_line(error)}): start the sweep again") from error
     return spec, settings

@@ -50,14 +50,14 @@ class RunWriter:
         """
         self.path, self.spec, self.resume = path, spec, resume
         self._lock = filelock.FileLock(path / LOCK, timeout=0)
-        if path.exists() and not path.is_dir():
+        if os.path.exists(path) and not os.path.isdir(path):
             raise UserError(f"{path} is a file: choose another --out")
-        there = [name for name in (*RUN_FILES, CHECKPOINTS) if (path / name).exists()]
-        if there and not (overwrite or resume):
-            raise UserError(f"{path} already holds a run ({', '.join(there)}): choose another --out, or replace it with --overwrite")
         reason = why_unwritable(path)
         if reason:
             raise UserError(f"cannot write {path} ({reason}): choose another --out")
+        there = [name for name in (*RUN_FILES, CHECKPOINTS) if (path / name).exists()]
+        if there and not (overwrite or resume):
+            raise UserError(f"{path} already holds a run ({', '.join(there)}): choose another --out, or replace it with --overwrite")
         if (path / LOCK).exists():
             self._take_lock()
             self._lock.release()

@@ -15,6 +15,7 @@ from gymnasium.vector import AutoresetMode
 from hindrl_jax.base.environments import action_to_env, backends_with, can_step, compiler_options
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Array, tree_where
+from hindrl_jax.tasks.ids import check_not_forked
 from hindrl_jax.tasks.registry import make, viewer
 
 Observation = dict[str, np.ndarray]
@@ -50,6 +51,19 @@ class GoalTask:
         self.observation_space = Dict(observation=Box(low, high, dtype=np.float32), achieved_goal=goals, desired_goal=goals)
         self.action_space = Box(-1.0, 1.0, (env.action_dim,), np.float32)
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": env.render_fps}
+
+    def checked_actions(self, actions: Any, shape: tuple[int, ...]) -> np.ndarray:
+        """Actions as float32, if they have the shape, which JAX would broadcast them to or cut them at, and are numbers.
+
+        Raises:
+          UserError: if not.
+        """
+        given = np.asarray(actions, np.float32)
+        if given.shape != shape:
+            raise UserError(f"an action of {self.env.name} has shape {shape}, and the one given has shape {given.shape}: give one of action_space")
+        if np.isnan(given).any():
+            raise UserError(f"the action given to {self.env.name} is not a number in dimension {int(np.argwhere(np.isnan(given))[0][-1])}")
+        return given
 
     def unpack(self, rows: Any) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray]:
         """What `_pack` put together, in memory of its own: rows (..., D + G + 3) -> observation, reward, terminated, truncated."""
@@ -94,6 +108,20 @@ def _step(env: Any, continuing_task: bool, state: Any, action: Array) -> tuple[A
         reward = _is_reached(env.achieved_goal(observation), env.task_goal(), env.goal_tolerance)
         return state, _pack(env, observation, reward, 0.0, 0.0)
     return state, _pack(env, time_step.observation, time_step.reward, time_step.terminated, 0.0)
+
+
+def goal_task(name: str, arguments: dict[str, Any], render_mode: str | None, continuing_task: bool) -> GoalTask:
+    """A `GoalTask`, one for all that are equal: so a forked process, in which JAX computes no more, can still say what its spaces are."""
+    try:
+        return _equal_goal_task(name, tuple((key, type(value), value) for key, value in arguments.items()), render_mode, continuing_task)
+    except TypeError:  # an argument that cannot be hashed, which is refused, if so, in a line of its own
+        return GoalTask(name, arguments, render_mode, continuing_task)
+
+
+@functools.lru_cache(maxsize=64, typed=True)
+def _equal_goal_task(name: str, arguments: tuple[tuple[str, type, Any], ...], render_mode: str | None, continuing_task: bool) -> GoalTask:
+    check_not_forked()
+    return GoalTask(name, {key: value for key, _, value in arguments}, render_mode, continuing_task)
 
 
 def draw_seed(generator: np.random.Generator) -> int:

@@ -29,8 +29,10 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from hindrl_jax.base.compilation import in_float32
 from hindrl_jax.base.errors import UserError
-from hindrl_jax.tasks._goal_task import NEVER, GoalTask, Observation, Running, draw_seed, programs, vector_programs
+from hindrl_jax.tasks._goal_task import NEVER, Observation, Running, draw_seed, goal_task, programs, vector_programs
+from hindrl_jax.tasks.ids import check_not_forked
 
 
 class GoalEnv(gymnasium.Env[Observation, np.ndarray]):
@@ -49,31 +51,43 @@ class GoalEnv(gymnasium.Env[Observation, np.ndarray]):
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012, as Gymnasium reads it off the class
 
+    @in_float32
     def __init__(self, name: str, *, render_mode: str | None = None, continuing_task: bool = False, **arguments: Any):
-        self._task = GoalTask(name, arguments, render_mode, continuing_task)
+        self._task = goal_task(name, arguments, render_mode, continuing_task)
         self.observation_space, self.action_space = self._task.observation_space, self._task.action_space
         self.metadata, self.render_mode = self._task.metadata, render_mode
         self._start, self._step = programs(self._task.env, continuing_task)
-        self._cpu = jax.devices("cpu")[0]
         self._seed: int | None = None
         self._episode = 0
         self._state: Any = None
 
+    @in_float32
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         """Starts an episode: the first of the seed's episodes, or without a seed the next."""
+        check_not_forked()
         super().reset(seed=seed)
         if seed is not None or self._seed is None:
             self._seed, self._episode = draw_seed(self.np_random), 0
         else:
             self._episode += 1
+        self._cpu = jax.devices("cpu")[0]
         with jax.default_device(self._cpu):
             self._state, row = self._start(np.uint32(self._seed), np.int32(self._episode))
         return self._task.unpack(row)[0], {"is_success": False}
 
+    @in_float32
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Takes one step: action (A,), clipped to [-1, 1]."""
+        """Takes one step: action (A,), clipped to [-1, 1].
+
+        Raises:
+          UserError: for an action of another shape, or one that is not a number.
+          gymnasium.error.ResetNeeded: before the first `reset`.
+        """
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("no episode has begun: call reset first")
+        action = self._task.checked_actions(action, self.action_space.shape)
         with jax.default_device(self._cpu):
-            self._state, row = self._step(self._state, np.asarray(action, np.float32))
+            self._state, row = self._step(self._state, action)
         observation, reward, terminated, truncated = self._task.unpack(row)
         return observation, float(reward), bool(terminated), bool(truncated), {"is_success": bool(reward > 0.0)}
 
@@ -81,6 +95,7 @@ class GoalEnv(gymnasium.Env[Observation, np.ndarray]):
         """1 where the goal is reached, else 0: goals (..., G) -> (...) float32. `info` is not used."""
         return self._task.compute_reward(achieved_goal, desired_goal, info)
 
+    @in_float32
     def render(self) -> np.ndarray | None:
         """A picture (H, W, 3) uint8 of the present state; None without a render mode."""
         return None if self.render_mode is None else self._task.picture(self._state)
@@ -102,6 +117,7 @@ class GoalVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
       UserError: as `GoalEnv`, and for a horizon that is none.
     """
 
+    @in_float32
     def __init__(
         self,
         name: str,
@@ -117,7 +133,7 @@ class GoalVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         limit: Any = NEVER if max_episode_steps in (None, -1) else max_episode_steps  # -1 is Gymnasium's word for never
         if not isinstance(limit, numbers.Integral) or limit < 1:
             raise UserError(f"max_episode_steps = {limit!r} is not usable: it must be at least 1, or -1 for never")
-        self._task = GoalTask(name, arguments, render_mode, continuing_task)
+        self._task = goal_task(name, arguments, render_mode, continuing_task)
         self.num_envs, self.render_mode = num_envs, render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self._task.metadata, "autoreset_mode": self.autoreset_mode}
@@ -128,6 +144,7 @@ class GoalVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         self._start, self._restart, self._step = vector_programs(self._task.env, continuing_task, min(int(limit), NEVER), self.autoreset_mode)
         self._running: Running | None = None
 
+    @in_float32
     def reset(self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         """Starts episodes everywhere, or where options["reset_mask"] (E,) says so.
 
@@ -135,6 +152,7 @@ class GoalVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
           seed: environment i gets seed + i, or item i of a sequence; without, each goes on to the next episode of the seed that it has.
           options: see above.
         """
+        check_not_forked()
         seed = int(seed) if isinstance(seed, numbers.Integral) else seed
         super().reset(seed=seed if isinstance(seed, int) else None)
         of_each = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else [None] * self.num_envs if seed is None else list(seed)
@@ -149,14 +167,16 @@ class GoalVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
             self._running = self._restart(self._running, chosen, seeds, is_new)
         return self._task.unpack(self._running.rows)[0], self._info(np.zeros(self.num_envs, bool), chosen)
 
+    @in_float32
     def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Takes one step of all: actions (E, A), clipped to [-1, 1].
 
         Raises:
+          UserError: for actions of another shape, or that are not numbers.
           gymnasium.error.ResetNeeded: before the first `reset`.
         """
         self._check_reset()
-        self._running, rows = self._step(self._running, np.asarray(actions, np.float32))
+        self._running, rows = self._step(self._running, self._task.checked_actions(actions, self.action_space.shape))
         observation, reward, terminated, truncated = self._task.unpack(self._running.rows)
         ended = terminated | truncated
         if self.autoreset_mode is not AutoresetMode.SAME_STEP or not ended.any():
@@ -172,6 +192,7 @@ class GoalVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         """As of `GoalEnv`."""
         return self._task.compute_reward(achieved_goal, desired_goal, info)
 
+    @in_float32
     def render(self) -> tuple[np.ndarray, ...] | None:
         """A picture (H, W, 3) uint8 of each environment; None without a render mode."""
         if self.render_mode is None:

@@ -90,6 +90,12 @@ class GymnasiumEnv:
     def action_high(self) -> np.ndarray:
         return self.description.action_high
 
+    def played_action(self, action: np.ndarray) -> np.ndarray:
+        """What the environment is given for an action (A,) in its own units: within the bounds, and whole where it takes whole numbers."""
+        rounded = np.rint(action) if self.description.whole_actions else action
+        half = 0.5 * (self.description.whole_actions & (self.action_low != self.action_high))
+        return np.clip(rounded, self.action_low + half, self.action_high - half).astype(np.float32)
+
     @property
     def render_fps(self) -> int:
         return self.description.render_fps

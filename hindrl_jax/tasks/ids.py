@@ -10,6 +10,8 @@ import contextlib
 import difflib
 import importlib
 import io
+import os
+import sys
 from typing import Any
 
 import gymnasium
@@ -27,6 +29,32 @@ MAX_EPISODE_STEPS = {
     "CableInsertion": 750,
 }
 """The names of `hindrl_jax.tasks.registry.TASKS` and their horizons, written out, since reading them there would import JAX."""
+
+
+_forked_from_jax = False
+
+
+def _note_fork() -> None:
+    """Runs in every forked process. JAX's threads do not live on in it, and what waits for them waits for ever."""
+    global _forked_from_jax
+    _forked_from_jax = _forked_from_jax or bool(getattr(sys.modules.get("jax._src.xla_bridge"), "_backends", None))
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_note_fork)
+
+
+def check_not_forked() -> None:
+    """Makes sure that JAX can compute in this process.
+
+    Raises:
+      UserError: if the process was forked from one in which JAX had computed.
+    """
+    if _forked_from_jax:
+        raise UserError(
+            "this process was forked from one that has used JAX, and JAX hangs in it: leave vectorization_mode out, so that one program steps all "
+            "environments, or have processes started afresh, gymnasium.make_vec(..., vector_kwargs={'context': 'spawn'})"
+        )
 
 
 def gymnasium_id(name: str) -> str:

@@ -25,7 +25,10 @@ The thesis has settings for the grid worlds and others for the reach tasks, whic
 from __future__ import annotations
 
 import dataclasses
+import decimal
 from typing import Any, Literal, get_args
+
+import numpy as np
 
 from hindrl_jax.base.environments import Environment, RelabelsObservations
 from hindrl_jax.base.errors import UserError
@@ -110,8 +113,18 @@ def _goals(env: Environment) -> GoalConfig:
     """Goals and epsilon, by what the environment is."""
     if _gives_goals(env):
         tolerance = getattr(env, "goal_tolerance", None)
-        return GoalConfig(behavioural_goals="environment", epsilon=None if tolerance is None else round(float(tolerance.min()), 4))
+        return GoalConfig(behavioural_goals="environment", epsilon=None if tolerance is None else _rounded_down(np.min(tolerance)))
     return GoalConfig(behavioural_goals="task" if isinstance(env, RelabelsObservations) else "final_demonstration_states")
+
+
+def _rounded_down(value: float) -> float:
+    """A number of four digits that is not above the value: a goal in hindsight is never easier than the task's own, and its box never empty.
+
+    Example:
+      >>> _rounded_down(0.05 / 3**0.5), _rounded_down(0.00002), _rounded_down(0.0)
+      (0.02886, 2e-05, 0.0)
+    """
+    return float(decimal.Context(prec=4, rounding=decimal.ROUND_FLOOR).create_decimal(str(value)))
 
 
 _FRAMEWORK: dict[str, Any] = dict(input_encoding="raw", actor_average_span=0.0)

@@ -11,12 +11,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from hindrl_jax.base.environments import Environment, RelabelsObservations, Restorable, backends_with, can_step
+from hindrl_jax.base.environments import Environment, RelabelsObservations, Restorable, backends_with, can_step, state_dim
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.steppers import can_step_on_host
 from hindrl_jax.base.types import Episodes
-from hindrl_jax.config import SWEEPABLE, TrainConfig, sweepable_value, with_traced_values
+from hindrl_jax.config import RESIDUAL_EXPANSION, SWEEPABLE, TrainConfig, sweepable_value, with_traced_values
 from hindrl_jax.core.train import warm_up_iterations
+from hindrl_jax.training.devices import free_memory, seed_mesh
 
 
 def can_train(env: Any) -> bool:
@@ -80,6 +81,69 @@ def steps_to_learn(env: Environment, config: TrainConfig) -> int:
     if config.num_steps <= at_random:
         raise UserError(f"steps = {config.num_steps} ends within the {at_random} random steps before learning: raise steps")
     return config.num_steps - at_random
+
+
+MOST_DEMONSTRATIONS = 100_000
+
+
+def check_memory(env: Environment, config: TrainConfig, num_runs: int, num_demos: int = 1) -> None:
+    """Compares what a training takes, as far as its sizes say, with the memory there is, before any of it is taken.
+
+    Args:
+      env: the task.
+      config: of the runs.
+      num_runs: S, side by side.
+      num_demos: demonstrations of each run.
+
+    Raises:
+      UserError: if it does not fit; it names what takes most of it, and what to lower.
+    """
+    rows = {name: 4 * num_runs * numbers / jax.process_count() for name, numbers in _numbers_in_memory(env, config, num_demos).items()}
+    # Nobody divides absurd numbers of seeds among devices, and one device has as much as all of them on a CPU.
+    free = free_memory(seed_mesh(num_runs))
+    needed, most = sum(rows.values()), max(rows, key=lambda name: rows[name])
+    if free is not None and needed > free:
+        what, advice = most.split(": ")
+        raise UserError(
+            f"{num_runs} run{'s' if num_runs > 1 else ''} side by side take{'' if num_runs > 1 else 's'} {needed / 2**30:,.1f} GiB of memory, "
+            f"{rows[most] / needed:.0%} of it for the {what}, and {free / 2**30:,.1f} GiB are free: lower {advice} or the number of seeds"
+        )
+
+
+def _numbers_in_memory(env: Environment, config: TrainConfig, num_demos: int) -> dict[str, float]:
+    """How many numbers of 4 bytes one run holds at a time, by what they are for and which options they follow from; a little less than it does."""
+    steps, dim, action_dim, agent, batch = env.horizon, env.observation_dim + env.goal_dim, env.action_dim, config.agent, config.batch
+    inputs, widths = 2 * dim + action_dim, [width * (RESIDUAL_EXPANSION if agent.residual else 1) for width in agent.net_arch]
+    weights = sum(before * after for before, after in zip([inputs, *widths], [*widths, agent.critic_outputs], strict=True))
+    demonstrations = num_demos * steps * (env.observation_dim + action_dim + state_dim(env))
+    networks = weights * (6 + 4 * agent.num_critics)  # parameters, targets and averages, moments, and those that are kept
+    in_networks = (1 + agent.num_critics) * sum(widths)
+    if not config.learns_from_rollouts:
+        drawn, replay = batch.batch_size * (dim + sum(widths)), 0.0
+    else:
+        drawn = config.num_updates * batch.batch_size * (batch.n_step + 2) * env.observation_dim + batch.batch_size * in_networks
+        replay = max(config.buffer_size, 2 * config.num_envs) * (env.observation_dim + action_dim)
+    return {
+        "demonstrations: horizon, the number of demonstrations": demonstrations,
+        "replay: buffer_size": replay,
+        "batches: batch_size, n_step, updates_per_iteration": drawn,
+        "networks: net_arch, num_critics, num_quantiles": networks,
+        "environments: num_envs": config.num_envs * (dim + state_dim(env) + sum(widths)),
+        "evaluations: eval_episodes": config.eval_episodes * (dim + state_dim(env) + sum(widths)),
+    }
+
+
+def check_demonstrations(num_demos: int) -> None:
+    """Makes sure that so many demonstrations can be recorded.
+
+    Raises:
+      UserError: if not.
+    """
+    if not 1 <= num_demos <= MOST_DEMONSTRATIONS:
+        few = num_demos < 1
+        raise UserError(
+            f"num_demos = {num_demos} is too {'few: record at least 1 demonstration' if few else f'many: record at most {MOST_DEMONSTRATIONS}'}"
+        )
 
 
 def check_seeds(seeds: Sequence[int]) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from hindrl_jax.base.compilation import keep_compiled_programs
+from hindrl_jax.base.compilation import in_float32, keep_compiled_programs
 from hindrl_jax.base.environments import Environment, can_step
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Episodes
@@ -18,7 +18,7 @@ from hindrl_jax.config import TrainConfig
 from hindrl_jax.core.agent import Policy, policy
 from hindrl_jax.core.holding import hold, hold_demonstrations, in_control_steps, with_action_hold
 from hindrl_jax.core.rollout import Evaluation
-from hindrl_jax.training.checks import check_config, check_seeds, check_trainable, configs_per_seed, demonstrations_per_seed
+from hindrl_jax.training.checks import check_config, check_memory, check_seeds, check_trainable, configs_per_seed, demonstrations_per_seed
 from hindrl_jax.training.devices import gather, spread
 from hindrl_jax.training.host import HostPrograms
 from hindrl_jax.training.programs import FRESH_EPISODES, JaxPrograms, Programs
@@ -32,6 +32,7 @@ class Diverged(UserError):
     """A loss or a value is not a finite number."""
 
 
+@in_float32
 def fit(
     env: Environment,
     demonstrations: Episodes | Sequence[Episodes],
@@ -77,6 +78,7 @@ def fit(
     configs = tuple(with_action_hold(config, tables) for config in configs_per_seed(config, seeds))
     config = configs[0]
     check_config(env, config)
+    check_memory(env, config, len(seeds), tables.lengths.shape[1])
     if config.demo_reset_ratio == 0.0:
         tables = tables.replace(states=None)  # nobody needs them on the devices
 

@@ -11,11 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hindrl_jax.base.environments import Environment, action_from_env, can_step
+from hindrl_jax.base.compilation import in_float32
+from hindrl_jax.base.environments import Environment, action_from_env, can_step, state_dim
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.steppers import HostStepped, Watchable
 from hindrl_jax.base.types import Array, Episodes
 from hindrl_jax.tasks.registry import task
+from hindrl_jax.training.checks import check_demonstrations
+from hindrl_jax.training.devices import free_memory, seed_mesh
 from hindrl_jax.training.playing import player, plays_one_by_one
 
 Expert = Any
@@ -24,6 +27,7 @@ Demonstrator = Callable[[Any, np.random.Generator], np.ndarray]
 """(an observation as the environment's own code gives it, randomness) -> action (A,) in the environment's own units."""
 
 
+@in_float32
 def record_demonstrations(env: Environment, num_demos: int, *, seed: int = 0, expert: Any = None) -> Episodes:
     """Records demonstrations with the task's own expert.
 
@@ -64,10 +68,15 @@ def record(key: Array, env: Environment, expert: Expert, num_demos: int, *, max_
     Raises:
       UserError: if `num_demos` is below 1, or the expert solves too few episodes, or the environment's back end is unusable.
     """
-    if num_demos < 1:
-        raise UserError(f"num_demos = {num_demos} is too few: record at least 1 demonstration")
+    check_demonstrations(num_demos)
     max_attempts = 100 * num_demos if max_attempts is None else max_attempts
     batch_size = 1 if plays_one_by_one(env) else max(num_demos, 16)
+    needed, free = 4 * batch_size * env.horizon * (env.observation_dim + env.action_dim + state_dim(env)), free_memory(seed_mesh(1))
+    if free is not None and needed > free:
+        raise UserError(
+            f"{batch_size} episodes of {env.horizon} steps side by side take {needed / 2**30:,.1f} GiB of memory, and {free / 2**30:,.1f} GiB are "
+            "free: lower horizon, or the number of demonstrations"
+        )
     play_batch = _expert_player(env, expert, batch_size)
     kept: list[Episodes] = []
     attempts = 0
@@ -85,6 +94,7 @@ def record(key: Array, env: Environment, expert: Expert, num_demos: int, *, max_
     return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)[:num_demos]), *kept)
 
 
+@in_float32
 def record_gymnasium(env: Watchable, policy: Demonstrator, num_demos: int, *, seed: int = 0, max_attempts: int | None = None) -> Episodes:
     """Records demonstrations that reach their goals, each cut where it does; others are discarded.
 
@@ -98,18 +108,18 @@ def record_gymnasium(env: Watchable, policy: Demonstrator, num_demos: int, *, se
     Raises:
       UserError: if `num_demos` is below 1, or the policy reaches too few goals.
     """
-    if num_demos < 1:
-        raise UserError(f"num_demos = {num_demos} is too few: record at least 1 demonstration")
+    check_demonstrations(num_demos)
     max_attempts = 100 * num_demos if max_attempts is None else max_attempts
     rng = np.random.default_rng(seed)
     kept: list[Episodes] = []
+    played_action = getattr(env, "played_action", lambda action: np.clip(action, env.action_low, env.action_high))
     with contextlib.closing(env.watched(with_pictures=False)) as stepper:
         observation, goal = stepper.begin(rng.integers(2**32, size=1))
         for _ in range(max_attempts):
             observations, actions, ended = [observation], [], False
             while not ended:
-                action = np.asarray(policy(stepper.raw_observation(), rng), np.float32)
-                actions.append(np.clip(action, env.action_low, env.action_high))
+                action = _checked(policy(stepper.raw_observation(), rng), env)
+                actions.append(played_action(action))
                 outcome = stepper.step(action[None])
                 observations.append(outcome.next_observation)
                 ended = outcome.ended[0]
@@ -123,6 +133,18 @@ def record_gymnasium(env: Watchable, policy: Demonstrator, num_demos: int, *, se
         f"the policy reached its goal in only {len(kept)} of {max_attempts} episodes of {env.name}, but {num_demos} demonstrations are wanted: "
         "ask for fewer, or give a better one"
     )
+
+
+def _checked(action: Any, env: Environment) -> np.ndarray:
+    """What a policy has chosen, as float32, if it is an action (A,) at all.
+
+    Raises:
+      UserError: if it is not.
+    """
+    action = np.asarray(action, np.float32)
+    if action.shape != (env.action_dim,) or not np.isfinite(action).all():
+        raise UserError(f"the policy chose {action.tolist()} in {env.name}, which takes {env.action_dim} finite numbers: mend the policy")
+    return action
 
 
 def _demonstration(env: HostStepped, observations: np.ndarray, actions: np.ndarray, goal: np.ndarray) -> Episodes:

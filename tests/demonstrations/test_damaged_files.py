@@ -114,8 +114,8 @@ def test_whatever_h5py_raises_while_reading_is_reported(path, monkeypatch, error
 
 
 def test_what_stands_beside_the_demonstrations_does_no_harm(path):
-    """Groups are kept for the tool that wrote them; a dataset at the top has no name of its own there."""
+    """It is kept for the tool that wrote it."""
     with h5py.File(path, "r+") as file:
         file["mask/train"], file["note"] = [b"demo_0"], 1.0
     recording = read_recording(path)
-    assert {name: array.tolist() for name, array in recording.extras.items()} == {"mask/train": [b"demo_0"]}
+    assert {name: array.tolist() for name, array in recording.extras.items()} == {"mask/train": [b"demo_0"], "note": 1.0}

@@ -47,7 +47,7 @@ def test_archive_of_somebody_else(tmp_path):
         ({"lengths": [1, 0]}, "at least 1"),
         ({"lengths": [1, 3]}, "observations has shape (5, 2), expected (6, any)"),
         ({"actions": np.full((3, 1), 2.0)}, "actions go from 2 to 2"),
-        ({"rewards": [0, np.nan, 0]}, "rewards does not hold finite numbers only"),
+        ({"rewards": [0, np.nan, 0]}, "rewards is not finite in row 0; put others in their place with --sparse-rewards"),
         ({"achieved_goals": None}, "--achieved-goal-keys"),
         ({"about": "[]"}, "about"),
         ({"about": json.dumps({"format_version": 1})}, "damaged"),

@@ -262,7 +262,7 @@ def test_a_loss_that_is_not_finite_stops_the_run(demonstrations):
 
 def test_a_replay_that_does_not_fit_is_refused_before_it_is_made(demonstrations):
     with pytest.raises(hindrl.UserError, match=r"2 runs side by side take [\d,.]+ GiB of memory, 100% of it for the replay.*: lower buffer_size or"):
-        fit(demonstrations, dataclasses.replace(CONFIG, buffer_size=10**10))
+        fit(demonstrations, dataclasses.replace(CONFIG, buffer_size=2 * 10**9))
 
 
 def test_memory_is_what_the_container_allows(tmp_path, monkeypatch):

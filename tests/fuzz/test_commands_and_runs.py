@@ -1,19 +1,18 @@
-"""Bad input of all kinds: one line and exit code 2, or accepted; never a traceback, and nothing written or lost.
+"""Command lines, configurations, files of ours and runs: one line and exit code 2, or accepted; never a traceback, and nothing written or lost."""
 
-`make test` tries some of each kind, `make test-slow` a thousand in all.
-"""
-
-import contextlib
 import dataclasses
 import json
 import shlex
 import shutil
 
 import h5py
-import hypothesis
 import hypothesis.strategies as st
+import jax
 import numpy as np
 import pytest
+from fuzzing import COUNTS, accepted, contents, fuzz
+from tiny import CONFIG
+from tiny import ENV as TINY_ENV
 
 import hindrl_jax as hindrl
 from hindrl_jax import cli
@@ -23,48 +22,6 @@ from hindrl_jax.runs.reader import load_run
 from hindrl_jax.runs.spec import RunSpec, read_spec
 
 ENV = hindrl.make("FixedGridPickAndPlace")
-SHARES = {"config": 350, "demonstrations": 250, "run": 100, "command line": 300}  # of a thousand
-QUICK = {"config": 60, "demonstrations": 60, "run": 30, "command line": 25}
-SETTINGS = dict(
-    deadline=None,
-    derandomize=True,
-    database=None,
-    suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture, hypothesis.HealthCheck.too_slow],
-)
-
-
-def fuzz(kind, *strategies):
-    """The test twice, quick and slow; derandomised, so that a failure is the same everywhere."""
-
-    def decorate(test):
-        amounts = [QUICK[kind], pytest.param(SHARES[kind], marks=pytest.mark.slow)]
-
-        @pytest.mark.parametrize("amount", amounts)
-        def repeated(amount, request, tmp_path, monkeypatch, capsys):
-            @hypothesis.settings(max_examples=amount, **SETTINGS)
-            @hypothesis.given(st.tuples(*strategies))
-            def once(drawn):
-                test(*drawn, request=request, tmp_path=tmp_path, monkeypatch=monkeypatch, capsys=capsys)
-
-            once()
-
-        repeated.__name__ = test.__name__
-        repeated.__doc__ = test.__doc__
-        return repeated
-
-    return decorate
-
-
-def refused_or_accepted(function, *arguments):
-    """Any other exception would be a traceback."""
-    with contextlib.suppress(hindrl.UserError):
-        function(*arguments)
-
-
-def contents(folder):
-    """Every file and what is in it."""
-    return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
-
 
 # ------------------------------------------------------------------------------------------------------------------------------- configs
 
@@ -119,7 +76,9 @@ def configs(draw):
 def test_configs(content, *, tmp_path, **_):
     path = tmp_path / "config.json"
     path.write_bytes(content)
-    refused_or_accepted(read_spec, path)
+    spec = accepted("config", read_spec, path)
+    if spec is not None:
+        assert RunSpec.from_json(json.loads(json.dumps(spec.to_json())), path) == spec
     assert path.read_bytes() == content
     assert [other.name for other in tmp_path.iterdir()] == ["config.json"]
 
@@ -181,8 +140,7 @@ def damage(path, damages):
                 file[name] = array
 
 
-@fuzz("demonstrations", damages())
-@pytest.mark.filterwarnings("ignore")
+@fuzz("file of ours", damages())
 def test_demonstrations(damaged, *, request, tmp_path, **_):
     path = shutil.copy(request.getfixturevalue("demonstrations_file"), tmp_path / "demos.hdf5")
     try:
@@ -190,7 +148,10 @@ def test_demonstrations(damaged, *, request, tmp_path, **_):
     except (OSError, KeyError, RuntimeError, IndexError):
         return  # an earlier damage has made the next one impossible
     content = path.read_bytes()
-    refused_or_accepted(hindrl.load_demonstrations, path, ENV)
+    table = accepted("file of ours", hindrl.load_demonstrations, path, ENV)
+    if table is not None:
+        assert all(np.isfinite(leaf).all() for leaf in (table.observations, table.actions, table.rewards, table.desired_goals))
+        assert np.abs(table.actions).max() <= 1.0 + 1e-4
     assert path.read_bytes() == content
     assert [other.name for other in tmp_path.iterdir()] == ["demos.hdf5"]
 
@@ -201,23 +162,68 @@ def test_demonstrations(damaged, *, request, tmp_path, **_):
 @pytest.fixture(scope="module")
 def finished_run(tmp_path_factory):
     path = tmp_path_factory.mktemp("runs") / "tiny"
-    small = "--num-envs 2 --learning-starts 200 --steps 210 --eval-every 40 --eval-episodes 3 --batch-size 16 --net-arch 8 --buffer-size 2000"
-    cli.main(["train", "--out", str(path), *small.split()])
+    config = dataclasses.replace(CONFIG, algo="bc", steps=2)
+    hindrl.save_run(path, hindrl.fit(TINY_ENV, hindrl.record_demonstrations(TINY_ENV, 1), config))
     return path
 
 
 @fuzz("run", st.sampled_from(["parameters.npz", "config.json"]), st.floats(0, 1, exclude_max=True), st.binary(max_size=40), st.booleans())
-@pytest.mark.filterwarnings("ignore")
 def test_runs(victim, where, inserted, longer, *, request, tmp_path, **_):
-    path = tmp_path / "run"
-    shutil.rmtree(path, ignore_errors=True)
-    shutil.copytree(request.getfixturevalue("finished_run"), path)
+    """Bytes of it are changed."""
+    path = copy_of_run(request, tmp_path)
     content = (path / victim).read_bytes()
     at = int(where * len(content))
     (path / victim).write_bytes(content[:at] + inserted + (content[at:] if longer else content[at + len(inserted) :]))
     before = contents(path)
-    refused_or_accepted(load_run, path)
+    accepted("run", load_run, path)
     assert contents(path) == before
+
+
+def copy_of_run(request, tmp_path):
+    path = tmp_path / "run"
+    shutil.rmtree(path, ignore_errors=True)
+    return shutil.copytree(request.getfixturevalue("finished_run"), path)
+
+
+@st.composite
+def changes(draw):
+    """What one of the arrays of a run becomes."""
+    kind = draw(st.sampled_from(["remove", "scalar", "shape", "type", "value", "below"]))
+    return (
+        kind,
+        draw(st.floats(0, 1, exclude_max=True)),
+        draw(st.sampled_from([np.nan, np.inf, -np.inf, 0.0, 1e38])),
+        draw(st.sampled_from(["S5", "U5", "?", "i4", "f2", "c8"])),
+    )
+
+
+@fuzz("run", st.lists(changes(), min_size=1, max_size=2))
+def test_parameters(drawn, *, request, tmp_path, **_):
+    """Arrays of it are changed; what is accepted plays with numbers."""
+    path = copy_of_run(request, tmp_path)
+    with np.load(path / "parameters.npz") as archive:
+        arrays = dict(archive)
+    for kind, where, value, letter in drawn:
+        name = sorted(arrays)[int(where * len(arrays))]
+        array = arrays.pop(name)
+        if kind == "remove":
+            continue
+        if kind == "scalar":
+            array = np.float32(value)
+        elif kind == "shape":
+            array = array[..., None] if where < 0.5 else array.reshape(-1)
+        elif kind == "type" and array.dtype.kind in "fiu":
+            array = array.astype(letter)
+        elif kind == "value" and array.dtype.kind == "f":
+            array = np.full_like(array, value)
+        arrays[f"{name}/x" if kind == "below" else name] = array
+    np.savez(path / "parameters.npz", **arrays)
+    before = contents(path)
+    run = accepted("run", load_run, path)
+    assert contents(path) == before
+    if run is not None:
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((run.policies, run.behavioural_goals)))
+        assert all(len(leaf) == len(run.spec.seeds) for leaf in jax.tree.leaves(run.policies))
 
 
 # ------------------------------------------------------------------------------------------------------------------------- command lines
@@ -225,12 +231,16 @@ def test_runs(victim, where, inserted, longer, *, request, tmp_path, **_):
 NUMBER = st.sampled_from(["0", "1", "-1", "3", "1e9", "nan", "inf", "-inf", "0.5", "1e400", "0x10", "", "ten", "1,2", "99999999999999999999"])
 TEXT = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=12)
 WORD = NUMBER | TEXT | st.sampled_from(["hindrl", "tqc", "thesis", "None", "True", ".", "/", "/dev/null", "missing.hdf5", "FixedGridPickAndPlace"])
+WORD |= st.sampled_from(
+    ["gymnasium:odd_env:Odd-v0", "gymnasium:odd_env:OddForever-v0", "gymnasium:X", "fault=raise", "dims=2", "x" * 300, "minari:x-v0"]
+)
 FLAG = st.sampled_from(
     shlex.split(
         "env algo preset config resume demos seeds seed out overwrite no-overwrite steps num-envs num-objects horizon size buffer-size batch-size "
         "learning-rate gamma n-step bc-weight net-arch num-quantiles epsilon-steps epsilon-deviations eval-every checkpoint-every over episodes to "
         "directory options tasks "
-        "expert host num-hosts distributed coordinator epsilon-filtering hindrl-sampling-strategy base backend num-waypoints"
+        "expert host num-hosts distributed coordinator epsilon-filtering hindrl-sampling-strategy base backend num-waypoints "
+        "noise make-kwargs make_kwargs vectorization n_step num-critics eval-episodes preset observation-keys solved cut filter-key restore csv"
     )
 )
 ARGUMENT = st.one_of(WORD, FLAG.map("--{}".format), st.tuples(FLAG, WORD).map(lambda pair: f"--{pair[0]}={pair[1]}"))
@@ -243,7 +253,6 @@ class WouldTrain(Exception):
 
 
 @fuzz("command line", COMMAND_WORDS | st.lists(WORD, max_size=2), st.lists(ARGUMENT, max_size=6))
-@pytest.mark.filterwarnings("ignore")
 def test_command_lines(words, arguments, *, tmp_path, monkeypatch, capsys, **_):
     def would_train(*args, **kwargs):
         raise WouldTrain
@@ -259,11 +268,13 @@ def test_command_lines(words, arguments, *, tmp_path, monkeypatch, capsys, **_):
     try:
         cli.main([*words, *arguments])
     except WouldTrain:
+        COUNTS["command line"]["accepted"] += 1
         return
     except SystemExit as stop:
         status = stop.code or 0
     printed = capsys.readouterr()
     assert status in (0, 2), (words, arguments)
+    COUNTS["command line"]["refused" if status else "accepted"] += 1
     if status == 2:
         *warnings, line = printed.err.splitlines()
         assert line.startswith("hindrl: "), printed.err
