@@ -47,6 +47,7 @@ def main() -> None:
     import jax
 
     from benchmarks import (
+        cable_holding,
         cable_parity,
         cable_speed,
         environments,
@@ -70,6 +71,7 @@ def main() -> None:
         "reach_parity": reach_parity,
         "cable_speed": cable_speed,
         "cable_parity": cable_parity,
+        "cable_holding": cable_holding,
         "host_loop": host_loop,
         "relabelling": relabelling,
         "replay_size": replay_size,
