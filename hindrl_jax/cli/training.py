@@ -40,7 +40,7 @@ def train(arguments: list[str]) -> None:
             Console(highlight=False, soft_wrap=True, markup=False, emoji=False, width=width).print(_summary_table(summary, spec.config))
             console.print(speed_line(summary))
             console.print(f"wrote {out}: {', '.join(writer.files())}")
-            if not any(seed["best_success"] or seed["returned_success"] for seed in summary["seeds"]):
+            if not any(seed["returned_success"] for seed in summary["seeds"]):
                 console.print(nothing_solved(writer.spec))
 
 
