@@ -63,7 +63,7 @@ def how_it_works(path: Path) -> None:
 
     box(0, 27, 22, 12, "demonstrations", "a few solved episodes,\nactions may be noisy", DEMO)
     box(0, 4, 22, 12, "rollouts", "episodes of the policy,\nkept in a replay buffer", ROLLOUT)
-    box(28, 17, 18, 12.5, "goals", "states that the\ndemonstrations\nreached", DEMO)
+    box(28, 18.8, 18, 12, "goals", "states that the\ndemonstrations\nreached", DEMO)
 
     rows = ((30, DEMO, "demonstrated", "reward 1 at the end"), (19, RELABELLED, "relabelled", "reward 1 where the\nnew goal is reached"))
     axes.text(64, 39.4, "one batch", ha="center", va="center", fontsize=11, color=INK, weight="bold")
@@ -76,9 +76,9 @@ def how_it_works(path: Path) -> None:
     box(80, 4, 20, 13, "actor", "the policy: high value,\nand near demonstrated\nactions", NETWORK)
 
     arrow((22, 35), (55, 35))
-    arrow((22, 28.5), (28, 26))
-    arrow((46, 23.5), (55, 23))
-    arrow((22, 13), (55, 18.5), "with another goal", (39, 13.7))
+    arrow((22, 29.5), (28, 27))
+    arrow((46, 24.5), (55, 23.5))
+    arrow((22, 13), (55, 18.5), "with another goal", (39, 12.9))
     arrow((22, 8), (55, 8), "as recorded", (39, 6.4))
     arrow((73, 24), (80, 29))
     arrow((73, 17), (80, 12))
