@@ -121,7 +121,7 @@ def test_parameters_that_cannot_be_played(path, capsys, name, change, message):
 @pytest.mark.parametrize("value", ["NaN", "1.5", "-0.1", "Infinity", '"all"', "[1]"])
 def test_success_that_is_no_share_is_not_compared(path, capsys, value):
     text = (path / "summary.json").read_text()
-    (path / "summary.json").write_text(re.sub(r'("final_success": )[\d.]+', rf"\g<1>{value}", text, count=1))
+    (path / "summary.json").write_text(re.sub(r'("returned_success": )[\d.]+', rf"\g<1>{value}", text, count=1))
     assert "is damaged" in refusal(capsys, "compare", path, path)
     (path / "summary.json").write_text(text)
     (path / "metrics.csv").write_text((path / "metrics.csv").read_text().replace(",0,", ",nan,"))
