@@ -85,13 +85,16 @@ def changed(config: TrainConfig, changes: Changes) -> TrainConfig:
     return checked(made)
 
 
-def is_finished(cell: Cell) -> bool:
-    """Whether the directory holds the finished run of just this cell.
+def is_finished(cell: Cell, *, any_seeds: bool = False) -> bool:
+    """Whether the directory holds the finished run of just this cell, or of this cell with any seeds.
 
     Raises:
       UserError: if it holds a configuration that cannot be read.
     """
-    return all((cell.path / name).exists() for name in (CONFIG, SUMMARY)) and _read_as_asked(cell) == cell.spec
+    if not all((cell.path / name).exists() for name in (CONFIG, SUMMARY)):
+        return False
+    found = _read_as_asked(cell)
+    return (dataclasses.replace(found, seeds=cell.spec.seeds) if any_seeds else found) == cell.spec
 
 
 def check_can_train(cells: Iterable[Cell], *, overwrite: bool) -> None:
