@@ -43,11 +43,11 @@ class Scale:
 
 SCALES: dict[ScaleName, Scale] = {
     "quick": Scale(
-        "A check that everything runs, not a measurement: 2 seeds; 24,000 environment steps of our recipe in place of 100,000; of the other two "
+        "A check that everything runs, not a measurement: 2 seeds; 16,000 environment steps of our recipe in place of 100,000; of the other two "
         "5,000, with batches of 256 and 1,000 random steps; 1,000 gradient steps of cloning; 20 episodes for each evaluation.",
         seeds={"default": 2, "thesis": 2, "original": 2},
         cloning=(("steps", 1_000), ("eval_every", 500), ("eval_episodes", 20)),
-        ours=(("steps", 24_000), ("eval_every", 4_000), ("eval_episodes", 20)),
+        ours=(("steps", 16_000), ("eval_every", 2_000), ("eval_episodes", 20)),
         theirs=(("steps", 5_000), ("eval_every", 1_000), ("eval_episodes", 20), ("learning_starts", 1_000), ("batch.batch_size", 256)),
     ),
     "laptop": Scale(

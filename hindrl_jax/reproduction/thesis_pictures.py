@@ -61,6 +61,8 @@ def draw(artifact: Artifact, runs: Mapping[Setting, RecordedRun], path: Path, *,
             _mark(axis, artifact)
             if artifact.panels[0] == "success":
                 axis.set_ylim(-3, 103)
+            else:
+                axis.set_ylim(bottom=0)
         if not artifact.apart and artifact.panels[0] in PANELS:
             axes[0].legend(frameon=False, fontsize="small")
         drawn.suptitle(f"{artifact.title}\n{recipe}", x=0.01, ha="left", fontsize="medium")
@@ -109,7 +111,6 @@ def _boxes(axis: Any, artifact: Artifact, runs: Mapping[Setting, RecordedRun]) -
             axis.scatter(np.full(len(steps), place), steps, color=SEED, s=14, zorder=3)
     axis.set_xticks(range(len(labels)), labels)
     axis.set(xlim=(-0.6, len(labels) - 0.4), ylabel="environment steps to 100%")
-    axis.set_ylim(bottom=0)
     axis.yaxis.set_major_formatter("{x:,.0f}")
 
 
@@ -119,14 +120,16 @@ def _prepare(axis: Any, panel: Panel) -> None:
 
 
 def _mark(axis: Any, artifact: Artifact) -> None:
+    """The thesis's own, as broken lines with a label."""
     for label, along, where in artifact.marks:
-        line, text = (axis.axvline, dict(x=where, y=0.02, rotation=90, va="bottom", ha="right")) if along == "x" else (axis.axhline, None)
-        line(where, color=DEMONSTRATION, linestyle="--", linewidth=1)
-        if text is None:
-            text = dict(x=0.02, y=where, va="bottom", ha="left", transform=axis.get_yaxis_transform())
+        line = dict(color=DEMONSTRATION, linestyle="--", linewidth=1)
+        words: dict[str, Any] = dict(s=f" {label} ", color=DEMONSTRATION, fontsize=8, va="bottom", in_layout=False, clip_on=True)
+        if along == "x":
+            axis.axvline(where, **line)
+            axis.text(x=where, y=0.0, rotation=90, ha="right", transform=axis.get_xaxis_transform(), **words)
         else:
-            text["transform"] = axis.get_xaxis_transform()
-        axis.text(s=label, color=DEMONSTRATION, fontsize=8, **text)
+            axis.axhline(where, **line)
+            axis.text(x=0.0, y=where, transform=axis.get_yaxis_transform(), **words)
 
 
 def _say(axis: Any, text: str) -> None:
