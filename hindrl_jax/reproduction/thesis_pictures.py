@@ -47,7 +47,7 @@ def draw(artifact: Artifact, runs: Mapping[Setting, RecordedRun], path: Path, *,
     """
     there = {setting: runs[setting] for setting in artifact.settings if setting in runs}
     number = len(artifact.settings) if artifact.apart else len(artifact.panels)
-    with figure(path, columns=number, figsize=(1.5 + 4.5 * number, 4.2), sharey=artifact.apart) as (drawn, axes):
+    with figure(path, columns=number, figsize=(1.5 + 4.5 * number, 4.2), sharex=True, sharey=artifact.apart) as (drawn, axes):
         if artifact.panels == ("steps_to_100",):
             _boxes(axes[0], artifact, there)
         elif artifact.apart:

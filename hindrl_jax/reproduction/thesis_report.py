@@ -78,7 +78,8 @@ def _draw_all(out: Path, readings: Readings) -> list[str]:
 
 _OF_CLAIMS = """A claim holds under a recipe where the whole 95% interval of each of its parts lies where it says, does not hold where none of one
 part's does, and is open in between. The thesis's text decides, our recipe where that is not run or open; where a claim does not hold there, the
-original code's run says whether its quirks made it. An interval of 2 seeds means nothing, one of fewer than 8 little.
+original code's run says whether its quirks made it. Cells of fewer than 4 seeds settle no comparison, and intervals of fewer than 8 are much too
+narrow.
 """
 _OF_TABLES = """Each cell: success of the returned policies in 100 fresh episodes, interquartile mean over seeds and its 95% bootstrap interval, in %;
 that of the best seed; seeds of which an evaluation along the run reached 95%; environment steps (BC: gradient steps) to it, median over all seeds.
@@ -175,7 +176,7 @@ def _cell_rows(readings: Readings, scale: ScaleName) -> list[dict[str, Any]]:
             for index, seed in enumerate(run.spec.seeds):
                 last = (run.success[-1, index], run.metrics["episode_length"][-1, index])
                 numbers = (run.returned_success[index], steps[index], *last, run.train_seconds / len(run.spec.seeds))
-                values = (*of_cell, config.num_steps, seed, *(f"{number:.6g}" for number in numbers), run.path)
+                values = (*of_cell, config.num_steps, seed, *(f"{number:.6g}" for number in numbers), "/".join(run.path.parts[-5:]))
                 rows.append(dict(zip(_CELL_COLUMNS, values, strict=True)))
     return rows
 

@@ -49,6 +49,9 @@ CONVERGED, FAILED = [[0.0] * 8, [1.0] * 8], [[0.0] * 8, [0.5] * 8]
         (Part("", "share", "converged", (A,), MORE_THAN_HALF), {A: CONVERGED}, Interval(1.0, 0.6756, 1.0), "holds"),
         (Part("", "share", "converged", (A,), MORE_THAN_HALF), {A: FAILED}, Interval(0.0, 0.0, 0.3244), "does not hold"),
         (Part("", "share", "converged", (A, B), MORE_THAN_HALF), {A: CONVERGED, B: FAILED}, Interval(0.5, 0.28, 0.72), "open"),
+        # three seeds may be all better by chance; four settle it
+        (Part("", "probability", "success", (A,), MORE_THAN_HALF, (B,)), {A: [[1.0] * 3], B: FAILED}, Interval(1.0, 1.0, 1.0), "open"),
+        (Part("", "probability", "success", (A,), MORE_THAN_HALF, (B,)), {A: [[1.0] * 4], B: FAILED}, Interval(1.0, 1.0, 1.0), "holds"),
         # nobody knows the interval of one seed
         (Part("", "difference", "success", (A,), ABOVE_ZERO, (B,)), {A: [[1.0]], B: FAILED}, Interval(0.5, -np.inf, np.inf), "open"),
     ],
