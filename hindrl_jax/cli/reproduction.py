@@ -26,6 +26,7 @@ from hindrl_jax.reproduction.thesis import ARTIFACTS
 from hindrl_jax.runs.recorded import read_recorded
 from hindrl_jax.tasks.registry import did_you_mean
 from hindrl_jax.training.checks import steps_to_learn
+from hindrl_jax.training.experiment import Diverged
 from hindrl_jax.training.result import Result
 
 
@@ -174,7 +175,7 @@ COMMANDS: dict[str, Callable[[list[str]], None]] = {"ablation": ablate, **{name:
 
 
 def _train_all(to_train: Sequence[Cell], say: Callable[[Cell], str], *, weight: Callable[[Cell], float]) -> None:
-    """Trains cells, with a bar for each, and then a line.
+    """Trains cells, with a bar for each, and then a line. One that diverges is left out, and the next one is trained.
 
     Args:
       to_train: in order.
@@ -186,12 +187,16 @@ def _train_all(to_train: Sequence[Cell], say: Callable[[Cell], str], *, weight: 
         for index, cell in enumerate(to_train):
             name = f"{cell.task} {cell.name}: "
             bar = progress.add_task(f"{name}compiling", total=cell.spec.config.num_steps, rates="")
-            cells.train(cell, report=functools.partial(_advance, progress, bar, name))
+            try:
+                cells.train(cell, report=functools.partial(_advance, progress, bar, name))
+                line = say(cell)
+            except Diverged as error:
+                line = f"{name}left out: {error}"
             progress.remove_task(bar)
             done += weight(cell)
             rest = to_train[index + 1 :]
             minutes = (time.perf_counter() - started) / done * sum(map(weight, rest)) / 60
-            progress.console.print(say(cell) + (f"   {len(rest)} left, about {minutes:,.0f} min" if rest else ""))
+            progress.console.print(line + (f"   {len(rest)} left, about {minutes:,.0f} min" if rest else ""))
 
 
 def _bars() -> Progress:
