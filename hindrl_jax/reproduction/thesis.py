@@ -55,7 +55,7 @@ class Artifact:
     apart: bool = False
     """Whether each setting has a panel of its own, with a line for each seed; else a line for each setting, the mean over its seeds."""
     marks: tuple[tuple[str, Literal["x", "y"], float], ...] = ()
-    """What the thesis's figure shows, in the units of the first panel, steps or value: (label, axis, where)."""
+    """What the thesis's figure shows, at a step (x) or a value of the first panel (y): (label, axis, where). Two at most."""
     remark: str = ""
     """What else must be known to read it."""
 
@@ -100,7 +100,7 @@ ARTIFACTS: dict[str, Artifact] = {
         "HinDRL on GridPickAndPlace by the number of demonstrations",
         tuple(setting for setting in _RANDOM if setting.algo == "hindrl"),
         panels=("success", "bc_loss", "hindsight_reward"),
-        marks=(("thesis: 95% with 250", "x", 130_000), ("thesis: 95% with 100", "x", 250_000)),
+        marks=(("thesis, 250 demonstrations: 95% at 130k", "x", 130_000), ("thesis, 100 demonstrations: 95% at 250k", "x", 250_000)),
         remark="The thesis's hindsight reward is 0 throughout.",
     ),
     "figure-5.2": Artifact(

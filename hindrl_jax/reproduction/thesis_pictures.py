@@ -63,8 +63,6 @@ def draw(artifact: Artifact, runs: Mapping[Setting, RecordedRun], path: Path, *,
                 axis.set_ylim(-3, 103)
             else:
                 axis.set_ylim(bottom=0)
-        if not artifact.apart and artifact.panels[0] in PANELS:
-            axes[0].legend(frameon=False, fontsize="small")
         drawn.suptitle(f"{artifact.title}\n{recipe}", x=0.01, ha="left", fontsize="medium")
 
 
@@ -77,14 +75,13 @@ def steps_to_100(run: RecordedRun) -> np.ndarray:
 def _means(axis: Any, panel: Panel, runs: Mapping[Setting, RecordedRun]) -> None:
     """A line for each setting: the mean over its seeds, and its interval."""
     _prepare(axis, panel)
-    for (setting, run), colour in zip(runs.items(), colours("viridis", len(runs), end=0.85), strict=True):
-        values = panel.values(run)
-        if values is None:
-            _say(axis, "not recorded")
-            continue
-        mean_line(axis, run.env_steps, values, colour=colour, label=f"{setting.title()} ({values.shape[1]} seeds)")
+    recorded = {setting: (run.env_steps, panel.values(run)) for setting, run in runs.items() if panel.values(run) is not None}
+    if not recorded:
+        _say(axis, "not recorded")
+    for (setting, (env_steps, values)), colour in zip(recorded.items(), colours("viridis", len(recorded), end=0.85), strict=True):
+        mean_line(axis, env_steps, values, colour=colour, label=f"{setting.title()} ({values.shape[1]} seeds)")
         if values.shape[1] > 1 and np.isfinite(values).all():
-            band(axis, run.env_steps, values, colour)
+            band(axis, env_steps, values, colour)
 
 
 def _seeds(axis: Any, panel: Panel, run: RecordedRun | None) -> None:
@@ -96,7 +93,6 @@ def _seeds(axis: Any, panel: Panel, run: RecordedRun | None) -> None:
         return
     axis.plot(run.env_steps, values, color=SEED, linewidth=1)
     axis.plot(run.env_steps, values.mean(axis=1), color=MEAN, linewidth=2, label=f"mean of {values.shape[1]} seeds")
-    axis.legend(frameon=False, fontsize="small")
 
 
 def _boxes(axis: Any, artifact: Artifact, runs: Mapping[Setting, RecordedRun]) -> None:
@@ -120,16 +116,13 @@ def _prepare(axis: Any, panel: Panel) -> None:
 
 
 def _mark(axis: Any, artifact: Artifact) -> None:
-    """The thesis's own, as broken lines with a label."""
-    for label, along, where in artifact.marks:
-        line = dict(color=DEMONSTRATION, linestyle="--", linewidth=1)
-        words: dict[str, Any] = dict(s=f" {label} ", color=DEMONSTRATION, fontsize=8, va="bottom", in_layout=False, clip_on=True)
-        if along == "x":
-            axis.axvline(where, **line)
-            axis.text(x=where, y=0.0, rotation=90, ha="right", transform=axis.get_xaxis_transform(), **words)
-        else:
-            axis.axhline(where, **line)
-            axis.text(x=0.0, y=where, transform=axis.get_yaxis_transform(), **words)
+    """The thesis's own, as broken lines; those at steps that no run has come to are out of sight, but named all the same."""
+    end = axis.get_xlim()
+    for (label, along, where), style in zip(artifact.marks, ("--", ":"), strict=False):
+        (axis.axvline if along == "x" else axis.axhline)(where, color=DEMONSTRATION, linestyle=style, linewidth=1.5, label=label)
+    axis.set_xlim(end)
+    if axis.get_legend_handles_labels()[1]:
+        axis.legend(frameon=False, fontsize="small")
 
 
 def _say(axis: Any, text: str) -> None:
