@@ -124,7 +124,10 @@ def _estimates(judged: Iterable[Judged]) -> str:
 
 
 def _short(interval: Interval | None) -> str:
-    return "not measurable" if interval is None else f"{interval.estimate:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
+    if interval is None:
+        return "not measurable"
+    around = "no interval" if np.isinf(interval.high) else f"[{interval.low:.2f}, {interval.high:.2f}]"
+    return f"{interval.estimate:.2f} {around}"
 
 
 def _between(ends: tuple[float, float]) -> str:
