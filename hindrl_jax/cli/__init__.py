@@ -35,7 +35,7 @@ COMMANDS: dict[str, Command | dict[str, Command]] = {
         "render": demonstrations.render,
         "convert": demonstrations.convert,
     },
-    "reproduce": {"ablation": reproduction.ablate},
+    "reproduce": reproduction.COMMANDS,
     "envs": environments.show,
     "policies": policies.show,
 }
@@ -55,7 +55,7 @@ def _usage() -> str:
     lines = [f"hindrl {__version__}: learn sparse-reward tasks from a handful of demonstrations", "", "commands:"]
     for name, command in COMMANDS.items():
         for words, function in [(name, command)] if callable(command) else [(f"{name} {sub}", f) for sub, f in command.items()]:
-            lines.append(f"  hindrl {words:<20}{function.__doc__}")
+            lines.append(f"  hindrl {words:<22}{function.__doc__}")
     return "\n".join([*lines, "", _STEPS, "", "`hindrl COMMAND --help` explains a command, `hindrl --version` prints the version.", _COMPLETION])
 
 

@@ -1,11 +1,11 @@
-"""`hindrl reproduce ...`: experiments on the recipe itself."""
+"""`hindrl reproduce ...`: experiments on the recipe itself, and those of the thesis."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +15,18 @@ from rich.table import Table
 
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.cli.common import console, counted, parse, seeds_from
-from hindrl_jax.reproduction import ablation, cells
+from hindrl_jax.reproduction import ablation, cells, thesis_report
+from hindrl_jax.reproduction.cells import Cell
+from hindrl_jax.reproduction.claims import settings_to_run
 from hindrl_jax.reproduction.options import OPTIONS
 from hindrl_jax.reproduction.outcomes import Outcome, outcomes_of
+from hindrl_jax.reproduction.scales import FIRST_SEED, SCALES, Recipe, ScaleName, num_cores, seconds_of
+from hindrl_jax.reproduction.scales import cells_of as thesis_cells
+from hindrl_jax.reproduction.thesis import ARTIFACTS
+from hindrl_jax.runs.recorded import read_recorded
 from hindrl_jax.tasks.registry import did_you_mean
 from hindrl_jax.training.checks import steps_to_learn
+from hindrl_jax.training.experiment import Diverged
 from hindrl_jax.training.result import Result
 
 
@@ -67,22 +74,129 @@ def ablate(arguments: list[str]) -> None:
     kept = len(chosen) - len(to_train)
     console.print(f"{counted(len(to_train), 'setting')} to train, {counted(given.seeds, 'seed')} from {given.seed}, {kept} finished before")
 
-    started = time.perf_counter()
-    with _bars() as progress:
-        for trained, cell in enumerate(to_train, 1):
-            name = f"{cell.task} {cell.name}: "
-            bar = progress.add_task(f"{name}compiling", total=cell.spec.config.num_steps, rates="")
-            cells.train(cell, report=functools.partial(_advance, progress, bar, name))
-            progress.remove_task(bar)
-            outcomes = outcomes_of(everything)
-            ablation.write_tables(given.out, outcomes)
-            left = len(to_train) - trained
-            minutes = (time.perf_counter() - started) / trained * left / 60
-            (outcome,) = (outcome for outcome in outcomes if outcome.cell == cell)
-            progress.console.print(_outcome_line(outcome) + (f"   {left} left, about {minutes:,.0f} min" if left else ""))
+    def table(cell: Cell) -> str:
+        outcomes = outcomes_of(everything)
+        ablation.write_tables(given.out, outcomes)
+        return _outcome_line(next(outcome for outcome in outcomes if outcome.cell == cell))
+
+    _train_all(to_train, table, weight=lambda cell: 1.0)
     if not to_train:
         ablation.write_tables(given.out, outcomes_of(everything))
     console.print(f"wrote {given.out}: {ablation.TABLE}, {ablation.TEXT}, {ablation.PICTURE}, and a run's directory for each setting")
+
+
+@dataclasses.dataclass(frozen=True)
+class Thesis:
+    """Options of `hindrl reproduce table-5.1` and the like."""
+
+    recipe: tuple[Recipe, ...] = ("default",)
+    """What to train with: default, the project's own recipe; thesis, the hyperparameters and the algorithm of its text; original, with the quirks of
+    its code, too. Several may be given."""
+    scale: ScaleName = "quick"
+    """How much of it: quick, a check that everything runs; laptop, a night or two on two cores; full, unchanged, meant for a GPU."""
+    seeds: int | None = None
+    """Number of seeds of each cell (default: that of the scale)."""
+    seed: int = FIRST_SEED
+    """The first seed; the others follow it."""
+    out: Path = Path("runs/thesis")
+    """Directory of the report and of all runs. Started again with the same options, what is finished there is kept, what was interrupted goes on at
+    its last checkpoint, and the rest is trained. Cells of another machine are put in by copying their folders."""
+    overwrite: bool = False
+    """Replace runs that were made with other options."""
+    report_only: bool = False
+    """Train nothing: write the report of what is there."""
+
+
+def reproduce(name: str, arguments: list[str]) -> None:
+    """Trains the cells of an artifact of the thesis that are not finished yet, and writes the report of all that are.
+
+    Args:
+      name: a key of `ARTIFACTS`, or "all".
+      arguments: of the command line.
+
+    Raises:
+      UserError: for options that are not usable, for a directory that holds something else, and if a run cannot be trained.
+    """
+    given = parse(Thesis, arguments, f"hindrl reproduce {name}", _WORDS[name])
+    if given.seeds is not None and given.seeds < 1:
+        raise UserError(f"--seeds {given.seeds} is too few: train at least 1 seed")
+    seeds_from(given.seeds or 1, given.seed)
+    names = tuple(ARTIFACTS) if name == "all" else (name,)
+    by_recipe = [
+        thesis_cells(
+            given.out,
+            settings_to_run(names, recipe=recipe, scale=given.scale),
+            recipe=recipe,
+            scale=given.scale,
+            num_seeds=given.seeds,
+            first_seed=given.seed,
+        )
+        for recipe in dict.fromkeys(given.recipe)
+    ]
+    chosen = list({cell.path: cell for of_recipe in by_recipe for cell in of_recipe.values()}.values())
+    if not given.report_only:
+        _train_thesis(chosen, given)
+    files = thesis_report.write(given.out, given.scale)
+    console.print(f"wrote {given.out}: {', '.join(files)}")
+
+
+def _train_thesis(chosen: list[Cell], given: Thesis) -> None:
+    cells.check_can_train(chosen, overwrite=given.overwrite)
+    for cell in chosen:
+        steps_to_learn(cell.spec.env, cell.spec.config)
+    to_train = [cell for cell in chosen if not cells.is_finished(cell)]
+    expected = functools.partial(seconds_of, cores=num_cores())
+    minutes = sum(expected(cell.spec) for cell in to_train) / 60
+    console.print(f"{given.scale}: {SCALES[given.scale].summary}")
+    console.print(
+        f"{counted(len(to_train), 'cell')} to train, {len(chosen) - len(to_train)} finished before; about {minutes:,.0f} min on "
+        f"{counted(num_cores(), 'core')} that have nothing else to do"
+    )
+    _train_all(to_train, _cell_line, weight=lambda cell: expected(cell.spec))
+
+
+def _cell_line(cell: Cell) -> str:
+    run = read_recorded(cell.path)
+    return f"{cell.group:<9}{cell.task:<12}{cell.name:<14}{thesis_report.cell_text(run):<40}{run.train_seconds:8.1f} s"
+
+
+def _command(name: str) -> Callable[[list[str]], None]:
+    def command(arguments: list[str]) -> None:
+        reproduce(name, arguments)
+
+    command.__doc__ = _WORDS[name]
+    return command
+
+
+_WORDS = {name: f"The thesis's {name.replace('-', ' ')}: {artifact.title}." for name, artifact in ARTIFACTS.items()}
+_WORDS["all"] = "All tables and figures of the thesis, with a verdict on each of its claims."
+COMMANDS: dict[str, Callable[[list[str]], None]] = {"ablation": ablate, **{name: _command(name) for name in _WORDS}}
+"""What `hindrl reproduce` can be given."""
+
+
+def _train_all(to_train: Sequence[Cell], say: Callable[[Cell], str], *, weight: Callable[[Cell], float]) -> None:
+    """Trains cells, with a bar for each, and then a line. One that diverges is left out, and the next one is trained.
+
+    Args:
+      to_train: in order.
+      say: what to say of a cell that is trained.
+      weight: how much longer a cell takes than others, from which follows how long the rest will take.
+    """
+    started, done = time.perf_counter(), 0.0
+    with _bars() as progress:
+        for index, cell in enumerate(to_train):
+            name = f"{cell.task} {cell.name}: "
+            bar = progress.add_task(f"{name}compiling", total=cell.spec.config.num_steps, rates="")
+            try:
+                cells.train(cell, report=functools.partial(_advance, progress, bar, name))
+                line = say(cell)
+            except Diverged as error:
+                line = f"{name}left out: {error}"
+            progress.remove_task(bar)
+            done += weight(cell)
+            rest = to_train[index + 1 :]
+            minutes = (time.perf_counter() - started) / done * sum(map(weight, rest)) / 60
+            progress.console.print(line + (f"   {len(rest)} left, about {minutes:,.0f} min" if rest else ""))
 
 
 def _bars() -> Progress:

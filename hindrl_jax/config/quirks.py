@@ -13,14 +13,15 @@ class QuirksConfig:
     """Deviations that explain published figures; no recipe of this project has any. Off by default."""
 
     strict_goal_test: bool = False
-    """A goal counts as reached at distance < epsilon, as in the thesis's formula and code, not <=. With epsilon 0 it never does."""
+    """A goal counts as reached at distance < epsilon, as in the thesis's formula and code, not <=. With epsilon 0 it never does. The filter of
+    demonstrated goals keeps what is farther than epsilon all the same, as in the code."""
     bootstrap_past_relabelled_goals: bool = False
     """Reaching a relabelled goal does not end the return, as in the thesis, so that values can exceed 1. Where hindsight relabels observations in
     place of goals (ParameterizedReach), a solved task always ends it."""
     timeouts_are_terminal: bool = False
     """Treat episodes that are cut by the horizon as terminated, as the original code does by mistake."""
     exclude_last_goal: bool = False
-    """Never draw the last goal of a demonstration, as the original code does by mistake."""
+    """Never draw the last goal of a demonstration, of those that the filter keeps, as the original code does by mistake; its only one is drawn."""
     unscaled_demo_actions: bool = False
     """Leave demonstrated actions in the environment's own range, as the original code does, in place of the policy's [-1, 1]."""
     misaligned_demo_actions: bool = False

@@ -65,16 +65,15 @@ def epsilon_from_demonstrations(achieved_goals: Array, lengths: Array, *, steps:
     return mean + deviations * jnp.sqrt(variance)
 
 
-def epsilon_filter(achieved_goals: Array, epsilon: Array, *, inclusive: bool = True) -> Array:
+def epsilon_filter(achieved_goals: Array, epsilon: Array) -> Array:
     """Marks the steps of one demonstration that are worth keeping as goals.
 
     Walking forward in time, step t is kept when its goal lies outside the box of half-width epsilon around the last kept goal. The first
-    step is always kept.  (Thesis, algorithm 6; box test as in eq. 4.8.)
+    step is always kept. The edge belongs to the box, as in the original code, whatever the test of rewards.  (Thesis, algorithm 6.)
 
     Args:
       achieved_goals: (T, G) goals reached along one demonstration, in task units.
       epsilon: (G,) half-width of the box, same units, >= 0.
-      inclusive: which box test, see `goal_reached`.
 
     Returns:
       (T,) bool mask; its length does not depend on the data, so the function can be vmapped over demonstrations.
@@ -86,11 +85,22 @@ def epsilon_filter(achieved_goals: Array, epsilon: Array, *, inclusive: bool = T
     """
 
     def walk(last_goal: Array, goal: Array) -> tuple[Array, Array]:
-        keep = ~goal_reached(goal, last_goal, epsilon, inclusive=inclusive)
+        keep = ~goal_reached(goal, last_goal, epsilon)
         return jnp.where(keep, goal, last_goal), keep
 
     _, keep_rest = jax.lax.scan(walk, achieved_goals[0], achieved_goals[1:])
     return jnp.concatenate([jnp.ones(1, bool), keep_rest])
+
+
+def without_last(keep: Array) -> Array:
+    """The mask (T,) without the last step that it marks; the only one stays, since a demonstration without goals could not be drawn from.
+
+    Example:
+      >>> without_last(jnp.array([True, False, True, False])).tolist()
+      [True, False, False, False]
+    """
+    rank = jnp.cumsum(keep)
+    return keep & (rank < jnp.maximum(rank[-1], 2))
 
 
 class GoalTest(struct.PyTreeNode, kw_only=True):

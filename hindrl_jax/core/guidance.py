@@ -46,9 +46,11 @@ def guidance(demonstrations: Episodes, env: Environment, config: TrainConfig) ->
     else:
         epsilon = jnp.full(env.goal_dim, config.goal.epsilon)
     behavioural_goals, desired_goals = _behavioural_goals(demonstrations, achieved, env, config)
-    keep = goals.is_visited(lengths - int(config.quirks.exclude_last_goal), achieved.shape[1])
+    keep = goals.is_visited(lengths, achieved.shape[1])
     if config.goal.epsilon_filtering:
-        keep &= jax.vmap(lambda path: goals.epsilon_filter(path, epsilon, inclusive=not config.quirks.strict_goal_test))(achieved)
+        keep &= jax.vmap(lambda path: goals.epsilon_filter(path, epsilon))(achieved)
+    if config.quirks.exclude_last_goal:
+        keep = jax.vmap(goals.without_last)(keep)
     return Guidance(
         demonstrations=demonstrations.replace(desired_goals=desired_goals),
         goals=goals.goal_table(observations, achieved, keep),

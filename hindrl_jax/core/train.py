@@ -243,7 +243,11 @@ def gradient_steps(key: Array, state: TrainState, batches: Transition, env: Envi
         (key, agent), (index, batch) = carry, update
         key, key_update = jax.random.split(key)
         agent, metrics = agents.update(key_update, agent, batch, _agent_schedule(state, state.updates + index, env, config), config)
-        shares = {"batch/relabelled": jnp.mean(batch.is_relabelled), "batch/demonstrations": jnp.mean(batch.is_demonstration)}
+        shares = {
+            "batch/relabelled": jnp.mean(batch.is_relabelled),
+            "batch/demonstrations": jnp.mean(batch.is_demonstration),
+            "batch/hindsight_reward": jnp.sum(jnp.where(batch.is_relabelled, batch.reward, 0.0)),
+        }
         return (key, agent), {**metrics, **shares}
 
     (_, agent), metrics = jax.lax.scan(gradient_step, (key, state.agent), (jnp.arange(num_updates), batches))

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from scipy import stats
 
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
@@ -57,6 +58,50 @@ def bootstrap_difference(values: Sequence[float] | np.ndarray, baseline: Sequenc
         return bootstrap(values - baseline)
     low, high = np.quantile(_mean_draws(values[None]) - _mean_draws(baseline[None], seed=1), _TAILS, axis=0, method="inverted_cdf")[:, 0]
     return Interval(estimate=float(values.mean() - baseline.mean()), low=float(low), high=float(high))
+
+
+def stratified_bootstrap(strata: Sequence[Sequence[float] | np.ndarray], statistic: Callable[[Sequence[np.ndarray]], np.ndarray]) -> Interval:
+    """A statistic of several groups of values, and its 95% interval, the values of each group being drawn anew among themselves.
+
+    As in `bootstrap`. Of a group of a single value nothing is known: the interval is infinitely wide.
+
+    Args:
+      strata: one group of values, (S,) each, for each cell of the experiment; the groups may differ in their size.
+      statistic: of the groups, (..., S) each, gives (...).
+    """
+    groups = [np.asarray(group, np.float64) for group in strata]
+    estimate = float(statistic(groups))
+    if min(map(len, groups)) < 2:
+        return Interval(estimate, -np.inf, np.inf)
+    rng = np.random.default_rng(0)
+    drawn = statistic([group[rng.integers(len(group), size=(RESAMPLES, len(group)))] for group in groups])
+    low, high = np.quantile(drawn, _TAILS, method="inverted_cdf")
+    return Interval(estimate, float(low), float(high))
+
+
+def interquartile_mean(values: Sequence[float] | np.ndarray) -> np.ndarray:
+    """The mean of the middle half: (..., S) -> (...). A quarter of the values, rounded down, is left out at each end."""
+    return stats.trim_mean(values, 0.25, axis=-1)
+
+
+def probability_of_improvement(values: np.ndarray, baseline: np.ndarray) -> np.ndarray:
+    """The chance that a value is larger than one of the baseline's, where equal ones count half (Mann and Whitney's U over its maximum).
+
+    Args:
+      values: (..., S).
+      baseline: (..., T).
+
+    Returns:
+      (...) in [0, 1].
+    """
+    values, baseline = values[..., :, None], baseline[..., None, :]
+    return (np.mean(values > baseline, axis=(-2, -1)) + np.mean(values >= baseline, axis=(-2, -1))) / 2.0
+
+
+def share(count: int, number: int) -> Interval:
+    """The share count / number, with Wilson's 95% interval (Wilson, 1927), which is also of use where all or none are counted."""
+    interval = stats.binomtest(count, number).proportion_ci(CONFIDENCE, method="wilson")
+    return Interval(count / number, float(interval.low), float(interval.high))
 
 
 def bootstrap_band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

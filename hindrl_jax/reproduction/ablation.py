@@ -17,8 +17,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from hindrl_jax.base.files import disk_trouble
-from hindrl_jax.reproduction.cells import Cell, Task
-from hindrl_jax.reproduction.options import BASELINE, OPTIONS, RECIPE, Option, apply
+from hindrl_jax.reproduction.cells import Cell, Task, changed
+from hindrl_jax.reproduction.options import BASELINE, OPTIONS, RECIPE, Option
 from hindrl_jax.reproduction.outcomes import Outcome
 from hindrl_jax.reproduction.picture import save_differences
 from hindrl_jax.reproduction.tables import EXPLANATION, markdown, write_csv
@@ -53,7 +53,7 @@ def cells_of(out: Path, *, tasks: Iterable[str], options: Iterable[Option], seed
         config = RECIPE
         if steps is not None:
             config = checked(functools.partial(dataclasses.replace, config, steps=steps))
-        spec = RunSpec(env=make(task.env, **dict(task.env_args)), config=apply(config, option), demos=str(task.num_demos), seeds=seeds)
+        spec = RunSpec(env=make(task.env, **dict(task.env_args)), config=changed(config, option.changes), demos=str(task.num_demos), seeds=seeds)
         cells.append(Cell(task=name, group=option.group, name=option.name, path=out / name / option.name, spec=spec))
     return cells
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Literal
+from typing import Literal
 
 from hindrl_jax.config import AgentConfig, BatchConfig, GoalConfig, QuirksConfig, TrainConfig
-from hindrl_jax.tasks.registry import checked
+from hindrl_jax.reproduction.cells import Changes
 
 Group = Literal["baseline", "algorithm", "hindsight", "goals", "targets", "demonstrations", "critic", "actor", "inputs", "replay", "rollout"]
 
@@ -21,8 +21,8 @@ class Option:
     """What part of the recipe it is about."""
     summary: str
     """One line: what it changes, and the paper that it is from, if any."""
-    changes: tuple[tuple[str, Any], ...]
-    """Fields of `TrainConfig`, as in "steps" or "batch.n_step", and their new values. A value may be a function of the unchanged config."""
+    changes: Changes
+    """What is changed, see `cells.changed`."""
 
 
 def half_of_the_run(config: TrainConfig) -> int:
@@ -173,22 +173,3 @@ OPTIONS: tuple[Option, ...] = (
     ),
     Option("updates-8", "rollout", "8 gradient steps per vectorised environment step in place of 2", (("updates_per_iteration", 8),)),
 )
-
-
-def apply(config: TrainConfig, option: Option) -> TrainConfig:
-    """The config with an option's changes, all made at once.
-
-    Raises:
-      UserError: if the changed config is refused.
-    """
-    sections: dict[str, dict[str, Any]] = {"": {}}
-    for field, value in option.changes:
-        section, _, name = field.rpartition(".")
-        sections.setdefault(section, {})[name] = value(config) if callable(value) else value
-    outermost = sections.pop("")
-
-    def changed() -> TrainConfig:
-        parts = {section: dataclasses.replace(getattr(config, section), **values) for section, values in sections.items()}
-        return dataclasses.replace(config, **outermost, **parts)
-
-    return checked(changed)

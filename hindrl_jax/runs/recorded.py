@@ -15,6 +15,7 @@ from hindrl_jax.runs.spec import METRICS, SUMMARY, RunSpec, read_spec
 from hindrl_jax.training.result import SOLVED
 
 Axis = Literal["steps", "updates", "seconds"]
+_NEEDED = ("env_steps", "updates", "seconds", "success")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +34,8 @@ class RecordedRun:
     """(E,) of training, all seeds side by side."""
     success: np.ndarray
     """(E, S) share of an evaluation's episodes that are solved."""
+    metrics: dict[str, np.ndarray]
+    """(E, S) each: the other columns of `metrics.csv` by name, as in "episode_length" or "actor/bc_loss"; not a number where a field is empty."""
     returned_success: np.ndarray
     """(S,) share of 100 fresh episodes that the returned policies solve; of the last evaluation's, if the run is not finished."""
     train_seconds: float
@@ -86,6 +89,7 @@ def read_recorded(path: Path, label: str | None = None) -> RecordedRun:
         updates=columns["updates"][:, 0].astype(int),
         seconds=columns["seconds"][:, 0],
         success=columns["success"],
+        metrics={name: values for name, values in columns.items() if name not in _NEEDED},
         returned_success=columns["success"][-1] if final is None else final,
         train_seconds=float(columns["seconds"][-1, 0]) if total is None else total,
         finished=final is not None,
@@ -99,5 +103,6 @@ def _whole_evaluations(text: str, seeds: tuple[int, ...]) -> dict[str, Any]:
     for row in csv.DictReader(lines):
         evaluations.setdefault((int(row["env_steps"]), int(row["updates"])), {})[int(row["seed"])] = row
     whole = [[rows[seed] for seed in seeds] for rows in evaluations.values() if set(rows) == set(seeds)]
-    names = ("env_steps", "updates", "seconds", "success")
-    return {name: np.asarray([[float(row[name]) for row in rows] for rows in whole]) for name in names}
+    others = [name for name in (whole[0][0] if whole else ()) if name not in ("seed", *_NEEDED)]
+    columns: dict[str, Any] = {name: np.asarray([[float(row[name]) for row in rows] for rows in whole]) for name in _NEEDED}
+    return columns | {name: np.asarray([[float(row[name] or "nan") for row in rows] for rows in whole]) for name in others}

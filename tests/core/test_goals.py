@@ -96,38 +96,36 @@ def test_epsilon_by_hand():
     np.testing.assert_allclose(epsilon_from_demonstrations(table, lengths, steps=2, deviations=2.0), [5.0 + 2.0 * 8.0**0.5], rtol=1e-6)
 
 
-def filter_twin(goals, epsilon, *, inclusive):
+def filter_twin(goals, epsilon):
     """Thesis algorithm 6 as a plain loop."""
     last, mask = None, []
     for goal in goals:
-        within = last is not None and all(abs(g - z) <= e if inclusive else abs(g - z) < e for g, z, e in zip(goal, last, epsilon, strict=True))
+        within = last is not None and all(abs(g - z) <= e for g, z, e in zip(goal, last, epsilon, strict=True))
         mask.append(not within)
         if not within:
             last = goal
     return mask
 
 
-jitted_filter = jax.jit(epsilon_filter, static_argnames="inclusive")
+jitted_filter = jax.jit(epsilon_filter)
 
 
 @hypothesis.settings(deadline=None, max_examples=40)
 @hypothesis.given(
     goals=st.lists(st.tuples(QUARTERS, QUARTERS), min_size=6, max_size=6),
     epsilon=st.tuples(QUARTERS, QUARTERS).map(np.abs),
-    inclusive=st.booleans(),
 )
-def test_filter_is_that_of_a_plain_loop(goals, epsilon, inclusive):
+def test_filter_is_that_of_a_plain_loop(goals, epsilon):
     goals = np.array(goals, np.float32)
-    mask = jitted_filter(jnp.asarray(goals), jnp.asarray(epsilon, jnp.float32), inclusive=inclusive)
-    np.testing.assert_array_equal(mask, filter_twin(goals, epsilon, inclusive=inclusive))
+    mask = jitted_filter(jnp.asarray(goals), jnp.asarray(epsilon, jnp.float32))
+    np.testing.assert_array_equal(mask, filter_twin(goals, epsilon))
 
 
-@pytest.mark.parametrize(("inclusive", "kept"), [(True, [True, False, True, False, True]), (False, [True, True, True, True, True])])
-def test_filter_by_hand(inclusive, kept):
-    # Epsilon is 1 in x and 1 in y. The first goal is kept; (1, 0) is 1 away from it in x, on the edge of its box, which belongs to it unless the test
-    # is strict. (1, 2) is 2 away in y from (0, 0), and from (1, 0). (2, 2) is 1 away in x from (1, 2), on the edge again. (5, 2) is outside.
+def test_filter_by_hand():
+    # Epsilon is 1 in x and 1 in y. The first goal is kept; (1, 0) is 1 away from it in x, on the edge of its box, which belongs to it. (1, 2) is 2
+    # away in y from (0, 0), and from (1, 0). (2, 2) is 1 away in x from (1, 2), on the edge again. (5, 2) is outside.
     goals = jnp.array([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0], [2.0, 2.0], [5.0, 2.0]])
-    assert epsilon_filter(goals, jnp.array([1.0, 1.0]), inclusive=inclusive).tolist() == kept
+    assert epsilon_filter(goals, jnp.array([1.0, 1.0])).tolist() == [True, False, True, False, True]
 
 
 def test_filter_by_hand_measures_from_the_last_kept_goal_not_from_the_one_before():

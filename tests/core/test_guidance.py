@@ -75,10 +75,11 @@ def test_guidance_reads_no_padding():
         (dict(), dict(), [0.0, 1.0, 1.0, 3.0, 4.0, 5.0]),
         (dict(), dict(exclude_last_goal=True), [0.0, 1.0, 1.0, 4.0]),
         (dict(epsilon_filtering=True, epsilon=0.0), dict(), [0.0, 1.0, 3.0, 4.0, 5.0]),
-        (dict(epsilon_filtering=True, epsilon=0.0), dict(strict_goal_test=True), [0.0, 1.0, 1.0, 3.0, 4.0, 5.0]),
+        (dict(epsilon_filtering=True, epsilon=0.0), dict(strict_goal_test=True), [0.0, 1.0, 3.0, 4.0, 5.0]),  # the filter has no strict form
         (dict(epsilon_filtering=True, epsilon=1.0), dict(), [0.0, 3.0, 4.0]),
-        (dict(epsilon_filtering=True, epsilon=1.0), dict(strict_goal_test=True), [0.0, 1.0, 3.0, 4.0, 5.0]),
-        (dict(epsilon_filtering=True, epsilon=1.0), dict(exclude_last_goal=True), [0.0, 4.0]),
+        (dict(epsilon_filtering=True, epsilon=1.0), dict(strict_goal_test=True), [0.0, 3.0, 4.0]),
+        (dict(epsilon_filtering=True, epsilon=1.0), dict(exclude_last_goal=True), [0.0, 4.0]),  # 4 is all that its demonstration has
+        (dict(epsilon_filtering=True, epsilon=3.0), dict(exclude_last_goal=True), [0.0, 4.0]),
         (dict(epsilon_filtering=True, epsilon=1.5), dict(), [0.0, 3.0, 4.0]),  # the filter starts again in every demonstration: 4 is near 3 and stays
     ],
 )
@@ -133,11 +134,11 @@ def test_epsilon_and_filtering_follow_the_config():
     assert guidance_of(GoalConfig(epsilon=0.25)).epsilon.tolist() == [0.25]
 
 
-def test_the_filter_uses_the_goal_test_of_relabelling():
-    goal = GoalConfig(epsilon_steps=1, epsilon_filtering=True)
-    kept = {strict: goals_of(guidance_of(goal, QuirksConfig(strict_goal_test=strict), (1.0,)).goals) for strict in (False, True)}
-    # Epsilon is 1, the length of each step.
-    assert kept == {False: [0.0, 2.0, 4.0], True: [0.0, 1.0, 2.0, 3.0, 4.0]}
+def test_the_last_goal_is_the_last_one_that_the_filter_keeps():
+    # Demonstrations of 0, 1, 2, 3, 4 and 0, 2, 4. Epsilon 2.5 keeps 0, 3 and 0, 4: so 3 and 4 are dropped, and 3 is not the last state.
+    goal = GoalConfig(epsilon=2.5, epsilon_filtering=True)
+    assert goals_of(guidance_of(goal).goals) == [0.0, 3.0, 0.0, 4.0]
+    assert goals_of(guidance_of(goal, QuirksConfig(exclude_last_goal=True)).goals) == [0.0, 0.0]
 
 
 def test_demonstrated_actions_may_be_left_in_units_of_the_environment():

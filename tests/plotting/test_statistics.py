@@ -2,8 +2,18 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from hindrl_jax.plotting.statistics import Interval, bootstrap, bootstrap_band, bootstrap_difference
+from hindrl_jax.plotting.statistics import (
+    Interval,
+    bootstrap,
+    bootstrap_band,
+    bootstrap_difference,
+    interquartile_mean,
+    probability_of_improvement,
+    share,
+    stratified_bootstrap,
+)
 
 
 def test_bootstrap_by_hand():
@@ -46,3 +56,40 @@ def test_intervals_of_differences_and_of_curves_agree_with_those_of_values():
     np.testing.assert_allclose([low[1], high[1]], 0.3)
     with pytest.raises(ValueError, match="give at least 2"):
         bootstrap_band(np.ones((3, 1)))
+
+
+def test_interquartile_means_by_hand():
+    # Of 8 values 2 are left out at each end, of 5 or 4 one, of 3 none.
+    assert interquartile_mean([9.0, 1.0, 2.0, 3.0, 4.0, 5.0, -50.0, 90.0]) == pytest.approx(3.5)
+    assert interquartile_mean(np.array([[0.0, 1.0, 2.0, 6.0], [4.0, 4.0, 1.0, 9.0]])).tolist() == [1.5, 4.0]
+    assert interquartile_mean([0.0, 1.0, 2.0, 6.0, 100.0]) == pytest.approx(3.0)
+    assert interquartile_mean([0.0, 1.0, 5.0]) == pytest.approx(2.0)
+
+
+def test_probability_of_improvement_by_hand():
+    # Of the six pairs (1, 0) (1, 1) (1, 3), (2, 0) (2, 1) (2, 3) three are improvements and one is a draw.
+    assert probability_of_improvement(np.array([1.0, 2.0]), np.array([0.0, 1.0, 3.0])) == pytest.approx(3.5 / 6)
+    assert probability_of_improvement(np.array([np.inf, 1.0]), np.array([np.inf])) == pytest.approx(0.25)  # never and never is a draw
+    assert probability_of_improvement(np.zeros((5, 4)), np.ones((5, 3))).tolist() == [0.0] * 5
+
+
+def test_probability_of_improvement_is_mann_and_whitneys():
+    rng = np.random.default_rng(3)
+    values, baseline = rng.integers(6, size=9), rng.integers(6, size=7)
+    assert probability_of_improvement(values, baseline) == pytest.approx(stats.mannwhitneyu(values, baseline).statistic / (9 * 7))
+
+
+def test_shares_by_hand():
+    # Wilson: (p + z^2 / 2n -+ z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n), z^2 = 3.8415. For 0 of 4 the upper end is z^2 / (4 + z^2).
+    assert (share(0, 4).estimate, share(0, 4).low, share(0, 4).high) == pytest.approx((0.0, 0.0, 3.8415 / 7.8415), abs=1e-4)
+    assert (share(4, 4).low, share(4, 4).high) == pytest.approx((4 / 7.8415, 1.0), abs=1e-4)
+
+
+def test_strata_are_drawn_among_themselves():
+    # Were the two groups mixed, the mean of a draw would vary; among themselves, equal values give equal means.
+    mean = stratified_bootstrap([[0.0] * 6, [1.0] * 3], lambda groups: np.concatenate(groups, axis=-1).mean(axis=-1))
+    assert (mean.estimate, mean.low, mean.high) == pytest.approx((1 / 3,) * 3)
+    # A group of two is drawn as 0 0, 0 1, 1 0, 1 1, as in `bootstrap`; the other adds 10.
+    total = stratified_bootstrap([[0.0, 1.0], [10.0, 10.0]], lambda groups: groups[0].mean(axis=-1) + groups[1].mean(axis=-1))
+    assert total == Interval(10.5, 10.0, 11.0)
+    assert stratified_bootstrap([[0.0, 1.0], [2.0]], lambda groups: groups[1].mean(axis=-1)) == Interval(2.0, -np.inf, np.inf)

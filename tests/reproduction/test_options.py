@@ -11,7 +11,8 @@ from hindrl_jax.base.errors import UserError
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.core import train as training
 from hindrl_jax.core.guidance import guidance
-from hindrl_jax.reproduction.options import BASELINE, OPTIONS, RECIPE, Group, Option, apply, half_of_the_run
+from hindrl_jax.reproduction.cells import changed
+from hindrl_jax.reproduction.options import BASELINE, OPTIONS, RECIPE, Group, Option, half_of_the_run
 from hindrl_jax.tasks.registry import make
 from hindrl_jax.training.recording import record_demonstrations
 
@@ -19,15 +20,15 @@ from hindrl_jax.training.recording import record_demonstrations
 @pytest.mark.parametrize("option", OPTIONS, ids=lambda option: option.name)
 def test_every_option_changes_each_of_its_fields_and_nothing_else(option):
     config = RECIPE
-    before, after = (dataclasses.asdict(each) for each in (config, apply(config, option)))
+    before, after = (dataclasses.asdict(each) for each in (config, changed(config, option.changes)))
     for part in ("batch", "goal", "agent", "quirks"):
         before |= {f"{part}.{name}": value for name, value in before.pop(part).items()}
         after |= {f"{part}.{name}": value for name, value in after.pop(part).items()}
-    changed = {name for name in before if before[name] != after[name]}
+    different = {name for name in before if before[name] != after[name]}
     asked = {name for name, _ in option.changes}
     # joint_union names its share, which is the default's, for the reader
-    assert changed
-    assert changed == asked - {"batch.union_sampling_ratio"}
+    assert different
+    assert different == asked - {"batch.union_sampling_ratio"}
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +41,7 @@ def demonstration():
 def test_every_option_makes_a_program(option, demonstration):
     """Traced, not compiled: what the config's own checks let pass, the training must not refuse."""
     env, episodes = demonstration
-    config = apply(RECIPE, option)
+    config = changed(RECIPE, option.changes)
 
     def start_and_learn(key):
         data = guidance(episodes, env, config)
@@ -73,7 +74,7 @@ def test_the_summaries_speak_of_the_recipe_as_it_is():
 def test_changes_are_made_at_once_and_may_depend_on_the_config():
     config = TrainConfig(steps=1_000)
     option = Option("both", "targets", "", (("algo", "tqcfd"), ("batch.relabelled_per_original", 0.0), ("batch.reach_zero", half_of_the_run)))
-    changed = apply(config, option)  # one after the other they would be refused
-    assert (changed.algo, changed.batch.relabelled_per_original, changed.batch.reach_zero) == ("tqcfd", 0.0, 500)
+    after = changed(config, option.changes)  # one after the other they would be refused
+    assert (after.algo, after.batch.relabelled_per_original, after.batch.reach_zero) == ("tqcfd", 0.0, 500)
     with pytest.raises(UserError, match="n_step = 0"):
-        apply(config, Option("bad", "targets", "", (("batch.n_step", 0),)))
+        changed(config, (("batch.n_step", 0),))
