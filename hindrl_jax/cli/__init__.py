@@ -44,7 +44,7 @@ COMMANDS: dict[str, Command | dict[str, Command]] = {
 _STEPS = """\
 start with:
   hindrl render policy:FixedParameterizedReach
-  hindrl train --env FixedGridPickAndPlace --demos 1 --stop-at 0.98 --out runs/first
+  hindrl train --env FixedGridPickAndPlace --demos 1 --seed 2 --stop-at 0.98 --out runs/first
   hindrl render runs/first"""
 
 

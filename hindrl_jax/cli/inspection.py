@@ -34,7 +34,7 @@ class Info:
 
     source: tyro.conf.Positional[str]
     """The file, of hindrl_jax or another tool (.hdf5, .npz), or minari:NAME-v0."""
-    epsilon_steps: int = 0
+    epsilon_steps: int = 1
     """Distance in steps for epsilon (m of thesis eq. 4.7)."""
     epsilon_deviations: float = 0.0
     """Weight of the standard deviation in epsilon (k of thesis eq. 4.7)."""
