@@ -17,6 +17,7 @@ import numpy as np
 from gymnasium import logger
 from gymnasium.spaces import Box, Dict
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.vector.async_vector_env import AsyncState
 
 from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.base.steppers import Outcome, SimulationFailed
@@ -337,9 +338,10 @@ class Simulators:
 
     def close(self) -> None:
         """Ends the environments, and their processes if they have some. One that fails at it is a warning: what was learnt is worth more."""
-        if self._has_failed:  # else Gymnasium would wait for an answer of processes that are gone
-            for process in getattr(self._envs, "processes", ()):
+        if self._has_failed and self.env.vectorization == "async":  # else Gymnasium would wait for an answer of processes that are gone
+            for process in self._envs.processes:
                 process.terminate()
+            self._envs._state = AsyncState.DEFAULT
         try:
             with self._failure("when it was closed"):
                 self._envs.close(**{"terminate": True} if self._has_failed and self.env.vectorization == "async" else {})

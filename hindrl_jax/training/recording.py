@@ -71,7 +71,7 @@ def record(key: Array, env: Environment, expert: Expert, num_demos: int, *, max_
     check_demonstrations(num_demos)
     max_attempts = 100 * num_demos if max_attempts is None else max_attempts
     batch_size = 1 if plays_one_by_one(env) else max(num_demos, 16)
-    needed, free = 4 * batch_size * env.horizon * (env.observation_dim + env.action_dim + state_dim(env)), free_memory(seed_mesh(1))
+    needed, free = 4 * batch_size * env.horizon * (env.observation_dim + env.action_dim + state_dim(env)), free_memory(seed_mesh(jax.process_count()))
     if free is not None and needed > free:
         raise UserError(
             f"{batch_size} episodes of {env.horizon} steps side by side take {needed / 2**30:,.1f} GiB of memory, and {free / 2**30:,.1f} GiB are "

@@ -169,8 +169,8 @@ def test_an_episode_goes_on_from_a_restored_state_as_it_would_have(task):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"num_waypoints": 0}, "num_waypoints = 0 is not usable: it must be at least 1"),
-        ({"num_waypoints": 2.0}, "num_waypoints = 2.0 is not usable: it must be a whole number"),
+        ({"num_waypoints": 0}, "num_waypoints = 0 is not usable: it must be at least 1 and at most 1000"),
+        ({"num_waypoints": 2.0}, "num_waypoints = 2.0 is not usable: it must be a whole number of at most 2147483647"),
         ({"horizon": 0}, "horizon = 0 is not usable: it must be at least 1"),
         ({"position_tolerance": 0.0}, "position_tolerance = 0.0 is not usable: it must be greater than 0"),
         ({"rotation_tolerance": -0.1}, "rotation_tolerance = -0.1 is not usable: it must be greater than 0"),

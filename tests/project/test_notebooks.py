@@ -18,7 +18,10 @@ NOTEBOOKS = {
 }
 
 
-@pytest.mark.parametrize("name", NOTEBOOKS)
+_ALL = [pytest.param(name, marks=pytest.mark.slow) if name == "06_two_arms" else name for name in NOTEBOOKS]  # minutes of compilation
+
+
+@pytest.mark.parametrize("name", _ALL)
 @pytest.mark.filterwarnings("default")  # Jupyter's own deprecations are not ours to mend
 def test_notebook_runs(name):
     smaller, num_pictures, num_films = NOTEBOOKS[name]

@@ -150,6 +150,7 @@ def test_the_report_alone_trains_nothing(tmp_path, capsys):
     assert "wrote" in capsys.readouterr().out
 
 
+@pytest.mark.slow  # compiles another agent, 20 s
 def test_the_original_can_be_trained(tmp_path):
     run(tmp_path, "--recipe", "original")
     assert len(list(tmp_path.glob("cells/quick/original/fixed-1/*/summary.json"))) == 2
