@@ -338,13 +338,12 @@ class Simulators:
 
     def close(self) -> None:
         """Ends the environments, and their processes if they have some. One that fails at it is a warning: what was learnt is worth more."""
-        if self._has_failed and self.env.vectorization == "async":  # else Gymnasium would wait for an answer of processes that are gone
-            for process in self._envs.processes:
-                process.terminate()
+        terminate = self._has_failed and self.env.vectorization == "async"
+        if terminate:  # else Gymnasium would wait for an answer of processes that are gone
             self._envs._state = AsyncState.DEFAULT
         try:
             with self._failure("when it was closed"):
-                self._envs.close(**{"terminate": True} if self._has_failed and self.env.vectorization == "async" else {})
+                self._envs.close(**{"terminate": True} if terminate else {})
         except UserError as error:
             if not self._envs.closed:
                 warnings.warn(str(error), stacklevel=2)
