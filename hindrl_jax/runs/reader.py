@@ -108,7 +108,7 @@ class Run:
     def play(self, episodes: int = 1, *, seed: int | None = None, key: jax.Array | None = None, noise: float | None = None) -> Episodes:
         """Plays fresh episodes with one seed's policy (the first seed's by default), to be looked at step by step; solved or not.
 
-        The policy aims at the first behavioural goal, the end of the first demonstration.
+        Each episode aims at a behavioural goal that is drawn for it, as in `evaluate`: the end of a demonstration, say.
 
         Args:
           episodes: N, how many.

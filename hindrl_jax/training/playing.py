@@ -143,22 +143,22 @@ class TrainedPolicies:
         return self._evaluate_one_by_one(keys, num_episodes, report)
 
     def play(self, key: Array, index: int, num_episodes: int) -> Episodes:
-        """Plays fresh episodes with one policy, to be looked at step by step. It aims at the first behavioural goal.
+        """Plays fresh episodes with one policy, to be looked at step by step. Each aims at a behavioural goal that is drawn, as in evaluations.
 
         Raises:
           UserError: as `player`.
         """
         return self.player(index, num_episodes)(key)
 
-    def player(self, index: int, num_episodes: int, *, any_goal: bool = False) -> Callable[[Array], Episodes]:
-        """`player` of one policy. It aims at the first behavioural goal, or with `any_goal` at one drawn for the episode."""
+    def player(self, index: int, num_episodes: int) -> Callable[[Array], Episodes]:
+        """`player` of one policy. Each episode aims at a behavioural goal that is drawn for it."""
         env = self._decisions
         policy, goals = jax.tree.map(lambda leaf: leaf[index], (self.policies, self.behavioural_goals))
         choose = make_policy(policy, env, self.config)
 
         def act(key: Array, state: Any, observation: Array) -> Array:
             # The state's key is constant within an episode, and so is the goal drawn with it.
-            goal = sample_goals(jax.random.fold_in(state.key, 0), goals, 1) if any_goal else goals.goals[:1]
+            goal = sample_goals(jax.random.fold_in(state.key, 0), goals, 1)
             return action_to_env(choose(key, observation[None], goal)[0], env)
 
         return player(self.env, act, num_episodes, self.num_held)
@@ -208,7 +208,7 @@ class TrainedPolicies:
         success: Any = np.zeros((len(keys), num_episodes), bool)
         length: Any = np.zeros((len(keys), num_episodes), np.int32)
         for index, key in enumerate(keys):
-            play_episode = self.player(index, 1, any_goal=True)
+            play_episode = self.player(index, 1)
             for number, key_episode in enumerate(jax.random.split(key, num_episodes)):
                 outcome = play_episode(key_episode)
                 success[index, number], length[index, number] = outcome.terminated[0], outcome.lengths[0]
