@@ -26,7 +26,7 @@ from hindrl_jax.base.checks import check, check_types
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Array
 from hindrl_jax.tasks.ids import check_registered
-from hindrl_jax.tasks.simulators import Description, Simulators, arguments_of, describe
+from hindrl_jax.tasks.simulators import Description, Simulators, arguments_of, describe, played_actions
 
 PREFIX = "gymnasium:"
 
@@ -92,9 +92,9 @@ class GymnasiumEnv:
 
     def played_action(self, action: np.ndarray) -> np.ndarray:
         """What the environment is given for an action (A,) in its own units: within the bounds, and whole where it takes whole numbers."""
-        rounded = np.rint(action) if self.description.whole_actions else action
-        half = 0.5 * (self.description.whole_actions & (self.action_low != self.action_high))
-        return np.clip(rounded, self.action_low + half, self.action_high - half).astype(np.float32)
+        whole = self.description.whole_actions
+        half = 0.5 * (whole & (self.action_low != self.action_high))  # see `action_bounds`
+        return played_actions(action, self.action_low + half, self.action_high - half, whole=whole).astype(np.float32)
 
     @property
     def render_fps(self) -> int:

@@ -193,10 +193,9 @@ def action_bounds(where: str, space: Any) -> tuple[np.ndarray, np.ndarray]:
     return low, high
 
 
-def played_actions(actions: np.ndarray, space: Box) -> np.ndarray:
-    """What an environment is given for actions (..., A) in its own units: within its bounds, and whole numbers where it takes such."""
-    rounded = np.rint(actions) if _is_whole(space) else np.asarray(actions, np.float64)
-    return np.clip(rounded, space.low, space.high).astype(space.dtype)
+def played_actions(actions: np.ndarray, low: np.ndarray, high: np.ndarray, *, whole: bool) -> np.ndarray:
+    """What an environment is given for actions (..., A) in its own units: within its bounds (A,), and whole numbers where it takes such; float64."""
+    return np.clip(np.asarray(np.rint(actions) if whole else actions, np.float64), low, high)
 
 
 class Simulators:
@@ -291,9 +290,10 @@ class Simulators:
             )
         self._steps += 1
         first, last = self._steps.min(), self._steps.max()  # nobody says which of the environments it is that fails
+        played = played_actions(actions, space.low, space.high, whole=_is_whole(space))
         moment = f"at step {first}{'' if first == last else f' to {last}'} of an episode"
         with self._failure(moment):
-            self._observed, rewards, terminated, truncated, info = self._envs.step(played_actions(actions, space))
+            self._observed, rewards, terminated, truncated, info = self._envs.step(played.astype(space.dtype))
             success = self._successes(rewards, info)
         next_observation, _ = self.now()
         terminated = terminated | success

@@ -175,14 +175,16 @@ class TrainedPolicies:
         """
         if not isinstance(self.env, Watchable):
             raise UserError(f"{self.env.name} does not draw itself: play it, and draw the states")
-        policy, goals = jax.tree.map(lambda leaf: leaf[index : index + 1], (self.policies, self.behavioural_goals))
+        policy = jax.tree.map(lambda leaf: leaf[index : index + 1], self.policies)
+        goals = jax.tree.map(lambda leaf: leaf[index], self.behavioural_goals)
         host_policies = host_playing.HostPolicies(self.env, self.config, seed_mesh(1))
-        first_goal, pictures, num_solved = np.asarray(goals.goals[0, :1]), [], 0
+        pictures, num_solved = [], 0
         for key in keys:
             key_seed, key_act = jax.random.split(key)
             act = host_policies.acting(key_act[None], policy)
+            goal = np.asarray(sample_goals(jax.random.fold_in(key_act, 0), goals, 1))
             with contextlib.closing(self.env.watched(with_pictures=True)) as stepper:
-                episode, solved = host_playing.film(stepper, int(jax.random.bits(key_seed)), act, first_goal, self.num_held)
+                episode, solved = host_playing.film(stepper, int(jax.random.bits(key_seed)), act, goal, self.num_held)
             pictures += episode
             num_solved += solved
         return pictures, num_solved
