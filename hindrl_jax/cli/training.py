@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -17,8 +20,10 @@ from hindrl_jax.cli.train_options import is_number, parse_resume, parse_train
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.runs.spec import FROM_PYTHON, SUMMARY, RunSpec, read_spec
 from hindrl_jax.runs.writer import RunWriter
+from hindrl_jax.training.result import SOLVED, Row
 
 _TABLE_WIDTH = 92  # at least: a column whose name is cut is hard to read
+_GOOD = 0.8  # mean success of the returned policies from which on nobody needs advice
 
 
 def train(arguments: list[str]) -> None:
@@ -38,14 +43,16 @@ def train(arguments: list[str]) -> None:
             summary = writer.finish(result)
             width = max(console.width, _TABLE_WIDTH)
             Console(highlight=False, soft_wrap=True, markup=False, emoji=False, width=width).print(_summary_table(summary, spec.config))
+            for line in said_of_never(summary["seeds"], result.rows):
+                console.print(line)
             console.print(speed_line(summary))
             console.print(f"wrote {out}: {', '.join(writer.files())}")
-            if not any(seed["returned_success"] for seed in summary["seeds"]):
-                console.print(nothing_solved(writer.spec))
+            for line in advice(writer.spec, summary["seeds"], out):
+                console.print(line)
 
 
 def _summary_table(summary: dict[str, Any], config: TrainConfig) -> Table:
-    """A line for each seed: the policy that was kept and whether it plays mean or sampled actions, the last one, and when 95% was reached first."""
+    """A line for each seed: the policy that was kept and whether it plays mean or sampled actions, the last one, and when mean actions solved 95%."""
     cloning = not config.learns_from_rollouts  # and so takes no environment steps
     unit, updates, actions = ("updates", [], []) if cloning else ("env_steps", ["updates"], ["actions"])
     moment = "at update" if cloning else "at step"
@@ -66,8 +73,44 @@ def _summary_table(summary: dict[str, Any], config: TrainConfig) -> Table:
     return table
 
 
-def nothing_solved(spec: RunSpec) -> str:
-    """What to try, in order, after a run whose policies solved nothing."""
+def said_of_never(seeds: Sequence[Mapping[str, Any]], rows: Sequence[Row]) -> list[str]:
+    """What "never" means where the returned policy is good all the same: the column counts mean actions, and sampled ones may solve more.
+
+    Args:
+      seeds: those of `summary.json`.
+      rows: all evaluations of all of them.
+
+    Returns:
+      One line, or none where no seed needs it, as with bc, whose actions are never sampled.
+    """
+    reached: dict[int, str] = {}
+    for seed in seeds:
+        if seed["updates_to_95"] is None and seed["returned_success"] >= SOLVED:
+            own = [row for row in rows if row.seed == seed["seed"] and row.sampled_success is not None]
+            first = next((row for row in own if row.sampled_success >= SOLVED), None)
+            if own:
+                reached[seed["seed"]] = "not" if first is None else f"at {first.env_steps:,}"
+    if not reached:
+        return []
+    sampled = ", ".join(f"seed {seed} {when}" for seed, when in reached.items())
+    return [f'"never" counts evaluations along the run with mean actions only; with sampled actions 95% was reached: {sampled}']
+
+
+def advice(spec: RunSpec, seeds: Sequence[Mapping[str, Any]], out: Path) -> list[str]:
+    """What to try after a run that solved nothing, or little of what was asked for; no lines after a good one.
+
+    Args:
+      spec: what was trained.
+      seeds: those of `summary.json`.
+      out: the run's directory.
+    """
+    success = float(np.mean([seed["returned_success"] for seed in seeds]))
+    if success == 0.0:
+        return _nothing_solved(spec)
+    return _little_solved(spec, success, out) if success < min(_GOOD, spec.config.stop_at or _GOOD) else []
+
+
+def _nothing_solved(spec: RunSpec) -> list[str]:
     few = is_number(spec.demos) and int(spec.demos) < 10
     lines = ["no episode was solved. What to try, in this order:"]
     file = "FILE" if is_number(spec.demos) or spec.demos == FROM_PYTHON else spec.demos
@@ -79,4 +122,14 @@ def nothing_solved(spec: RunSpec) -> str:
         lines.append(f"more demonstrations: --demos {10 * int(spec.demos)}")
     if spec.config.algo != "bc" and not spec.config.demo_reset_ratio:
         lines.append("begin half of the training episodes in demonstrated states: --demo-reset-ratio 0.5")
-    return "\n".join([lines[0], *(f"  {number}. {line}" for number, line in enumerate(lines[1:], 1))])
+    return [lines[0], *(f"  {number}. {line}" for number, line in enumerate(lines[1:], 1))]
+
+
+def _little_solved(spec: RunSpec, success: float, out: Path) -> list[str]:
+    number = int(spec.demos) if is_number(spec.demos) else None
+    more = "" if number is None else f" (--demos {number * (10 if number < 10 else 2)})"
+    seeds = " and more seeds (--seeds 4)" if len(spec.seeds) == 1 else ""
+    return [
+        f"{success:.0%} of the episodes were solved. What may help: a longer run (--steps {2 * spec.config.num_steps}){seeds};",
+        f"more demonstrations{more}, above all of such starts as it fails from: `hindrl render {shlex.quote(str(out))} --episodes 5` films five episodes",
+    ]

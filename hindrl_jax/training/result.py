@@ -45,7 +45,7 @@ class Row:
 
 @dataclasses.dataclass(frozen=True)
 class SeedSummary:
-    """What became of one seed. The threshold of 95% refers to the evaluations along the run; None where it was never reached."""
+    """What became of one seed. The threshold of 95% is that of the mean actions in evaluations along the run; None where they never reached it."""
 
     seed: int
     returned_success: float

@@ -5,6 +5,7 @@ import dataclasses
 import json
 import shlex
 import shutil
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -16,11 +17,12 @@ import hindrl_jax as hindrl
 from hindrl_jax import cli
 from hindrl_jax.cli.policies import shipped
 from hindrl_jax.cli.train_options import parse_train
-from hindrl_jax.cli.training import nothing_solved
+from hindrl_jax.cli.training import advice, said_of_never
 from hindrl_jax.runs.reader import load_run
 from hindrl_jax.runs.spec import RunSpec
 from hindrl_jax.tasks import registry
 from hindrl_jax.tasks.presets import preset
+from hindrl_jax.training.result import Row
 
 SEED_FIELDS = {"seed", "final_success", "env_steps_to_95", "updates_to_95", "seconds_to_95", "episode_length", "evaluation_steps"}
 SEED_FIELDS |= {f"returned_{what}" for what in ("success", "length", "noise", "env_steps", "updates", "seconds")}
@@ -54,18 +56,66 @@ def test_run_directory_holds_what_it_promises(run):
         assert archive["policy/params/Dense_0/kernel"].shape == archive["last_policy/params/Dense_0/kernel"].shape == (2, 40, 8)
 
 
+def advised(spec, *returned, out="runs/mine"):
+    """What is said after a run whose seeds returned policies of this success."""
+    return advice(spec, [{"returned_success": success} for success in returned], Path(out))
+
+
 def test_a_run_that_solves_nothing_says_what_to_try():
     config = preset("hindrl")
     spec = RunSpec(env=hindrl.make("FixedGridPickAndPlace"), config=config, demos="1", seeds=(0,))
-    lines = nothing_solved(spec).splitlines()
+    lines = advised(spec, 0.0)
     assert [line.split(".")[0].strip() for line in lines[1:]] == ["1", "2", "3", "4", "5"]
     assert "hindrl demos info" in lines[1]
     assert "--steps 200000" in lines[3]
     assert "--demos 10" in lines[4]
-    of_file = nothing_solved(dataclasses.replace(spec, demos="mine.hdf5", config=preset("bc")))
+    of_file = "\n".join(advised(dataclasses.replace(spec, demos="mine.hdf5", config=preset("bc")), 0.0))
     assert "hindrl demos info mine.hdf5" in of_file
     assert "--algo bc" not in of_file
     assert "--demo-reset-ratio" not in of_file
+
+
+def test_a_run_that_solves_little_says_what_to_try():
+    spec = RunSpec(env=hindrl.make("FixedGridPickAndPlace"), config=preset("hindrl"), demos="1", seeds=(0,))
+    lines = advised(spec, 0.43, out="runs/a run")
+    assert lines[0].startswith("43% of the episodes were solved")
+    assert len(lines) == 2
+    wanted = ["--steps 200000", "--seeds 4", "--demos 10", "hindrl render 'runs/a run' --episodes 5"]
+    places = ["\n".join(lines).find(one) for one in wanted]
+    assert -1 not in places
+    assert places == sorted(places)
+    assert "--demos 60" in advised(dataclasses.replace(spec, demos="30"), 0.43)[1]
+    of_file = "\n".join(advised(dataclasses.replace(spec, demos="mine.hdf5", seeds=(0, 1)), 0.9, 0.2))
+    assert of_file.startswith("55% ")
+    assert "--demos" not in of_file
+    assert "--seeds" not in of_file
+
+
+def test_a_run_that_did_what_was_asked_for_is_left_alone():
+    spec = RunSpec(env=hindrl.make("FixedGridPickAndPlace"), config=preset("hindrl"), demos="1", seeds=(0,))
+    assert advised(spec, 0.79)
+    assert not advised(spec, 0.8)
+    assert not advised(spec, 1.0, 0.6)  # on average
+    half = dataclasses.replace(spec, config=dataclasses.replace(spec.config, stop_at=0.5))
+    assert not advised(half, 0.6)
+    assert advised(half, 0.4)
+
+
+def evaluation(seed, env_steps, mean, sampled):
+    metrics = {} if sampled is None else {"evaluation/sampled_success": sampled}
+    return Row(seed=seed, env_steps=env_steps, updates=1, seconds=1.0, success=mean, episode_length=9.0, metrics=metrics)
+
+
+def test_never_is_explained_where_sampled_actions_solved_the_task():
+    """Seeds: 0 reached 95% with mean actions, 1 with sampled ones only, 2 in fresh episodes only, 3 not at all."""
+    shares = {0: ((0.5, 0.5), (0.95, 0.5)), 1: ((0.5, 0.95), (0.5, 1.0)), 2: ((0.9, 0.9), (0.9, 0.94)), 3: ((0.2, 0.2), (0.2, 0.2))}
+    rows = [evaluation(seed, 1_000 * (n + 1), *shares[seed][n]) for n in range(2) for seed in shares]
+    returned = {0: (1.0, 7), 1: (1.0, None), 2: (0.96, None), 3: (0.3, None)}
+    seeds = [{"seed": seed, "returned_success": share, "updates_to_95": at} for seed, (share, at) in returned.items()]
+    (line,) = said_of_never(seeds, rows)
+    assert line.endswith("with mean actions only; with sampled actions 95% was reached: seed 1 at 1,000, seed 2 not")
+    assert said_of_never([seeds[0], seeds[3]], rows) == []
+    assert said_of_never(seeds[2:3], [evaluation(2, 0, 0.9, None)]) == []  # of bc, which plays no sampled actions
 
 
 def test_config_runs_again_and_other_flags_change_it(run, tmp_path):
