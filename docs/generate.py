@@ -1,6 +1,9 @@
 """Writes docs/generated/: the pages that come from elsewhere in the project, so that they cannot go stale. `make docs` runs it first.
 
 The command line's page is what each command answers to --help-all; notebooks become pages without their outputs, since none are stored.
+
+It is a hook of mkdocs, too. The pages of docs/ are also read as they stand, in a checkout or where it is hosted, so they link to the project's files:
+to `../notebooks/01_quickstart.ipynb`, or `../hindrl_jax/core`. On the site, such a link leads to the page that is made of the file.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ import os
 import re
 import sys
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).parent.parent
 OUT = ROOT / "docs" / "generated"
@@ -24,6 +28,9 @@ PAGES = {
     "changelog.md": ("CHANGELOG.md", {}),
     "contributing.md": ("CONTRIBUTING.md", {}),
 }
+COMMANDS = "hindrl_jax/cli"
+"""What stands for the command line's page in links."""
+LINK = re.compile(r"(?<!!)\[([^\]]*)\]\(([^)\s]*)\)")
 
 
 def main() -> None:
@@ -48,7 +55,50 @@ def page(source: Path, links: dict[str, str]) -> str:
             return found[0]
         return f"[{text}]({links[target]})" if target in links else f"{text} (`{(source.parent / target).resolve().relative_to(ROOT)}`)"
 
-    return re.sub(r"\[([^\]]*)\]\(([^)]*)\)", link, source.read_text())
+    return LINK.sub(link, source.read_text())
+
+
+def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
+    """Called by mkdocs: the text of a page, whose links to files of the project lead to the pages made of them; without one, no link is left."""
+    folder, reference = (ROOT / "docs" / page.file.src_uri).parent, pages_of_modules()
+
+    def link(found: re.Match[str]) -> str:
+        text, target = found.groups()
+        if not target.startswith("../"):
+            return found[0]
+        file = Path(os.path.normpath(folder / target))
+        if file.is_relative_to(ROOT / "docs"):
+            return found[0]
+        made = page_of(file.relative_to(ROOT).as_posix(), reference)
+        return f"[{text}]({os.path.relpath(ROOT / 'docs' / made, folder)})" if made else text
+
+    return LINK.sub(link, markdown)
+
+
+def page_of(file: str, reference: dict[str, str]) -> str | None:
+    """The page, in docs/, that is made of a file or folder of the project; None where none is.
+
+    Args:
+      file: its path in the project.
+      reference: of `pages_of_modules`.
+    """
+    if file == COMMANDS:
+        return "generated/command-line.md"
+    if file.endswith(".ipynb"):
+        return f"generated/{Path(file).with_suffix('.md').name}"
+    made = next((name for name, (source, _) in PAGES.items() if source == file), None)
+    if made:
+        return f"generated/{made}"
+    module = file.removesuffix(".py").replace("/", ".")
+    if module in reference:
+        return f"{reference[module]}#{module}"
+    return next((where for name, where in reference.items() if name.startswith(f"{module}.")), None)
+
+
+def pages_of_modules() -> dict[str, str]:
+    """The page of the reference, in docs/, on which each module stands."""
+    pages = sorted((ROOT / "docs" / "api").glob("*.md"), key=lambda path: path.stem)
+    return {module: f"api/{path.name}" for path in pages for module in re.findall(r"^::: (\S+)$", path.read_text(), re.MULTILINE)}
 
 
 def notebook(path: Path) -> str:

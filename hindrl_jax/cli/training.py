@@ -131,5 +131,5 @@ def _little_solved(spec: RunSpec, success: float, out: Path) -> list[str]:
     seeds = " and more seeds (--seeds 4)" if len(spec.seeds) == 1 else ""
     return [
         f"{success:.0%} of the episodes were solved. What may help: a longer run (--steps {2 * spec.config.num_steps}){seeds};",
-        f"more demonstrations{more}, above all of such starts as it fails from: `hindrl render {shlex.quote(str(out))} --episodes 5` films five episodes",
+        f"more demonstrations{more}, above all of starts where it fails: `hindrl render {shlex.quote(str(out))} --episodes 5` films five",
     ]
