@@ -5,14 +5,17 @@ A refusal names the ability that is missing, see `hindrl_jax.base.environments`,
 
 from __future__ import annotations
 
+import inspect
+import traceback
 from collections.abc import Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from hindrl_jax.base.environments import Environment, RelabelsObservations, Restorable, backends_with, can_step, state_dim
-from hindrl_jax.base.errors import UserError
+from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.base.steppers import can_step_on_host
 from hindrl_jax.base.types import Episodes
 from hindrl_jax.config import RESIDUAL_EXPANSION, SWEEPABLE, TrainConfig, sweepable_value, with_traced_values
@@ -26,12 +29,13 @@ def can_train(env: Any) -> bool:
 
 
 def check_trainable(env: Environment) -> None:
-    """Makes sure that the environment can be stepped many at once, as it has to be to learn in.
+    """Makes sure that the environment can be stepped many at once, as it has to be to learn in, and that its dimensions are what it gives.
 
     Raises:
       UserError: if not.
     """
     if can_train(env):
+        check_dimensions(env)
         return
     others = backends_with(env, can_train)
     if others:
@@ -40,6 +44,71 @@ def check_trainable(env: Environment) -> None:
             f"train with backend {' or '.join(others)}"
         )
     raise UserError(f"{env.name} cannot be trained: it has neither reset and step in JAX, nor a stepper of many environments outside it")
+
+
+def check_dimensions(env: Environment) -> None:
+    """Makes sure that an environment's functions give arrays of the lengths that it states. Nothing is computed, and tasks of this package are not
+    looked at: their tests do that.
+
+    Args:
+      env: one that is stepped in JAX; others are checked where they are stepped.
+
+    Raises:
+      UserError: naming the first dimension that does not fit; or where `step` fails with an action of the length that the environment states.
+    """
+    if not can_step(env) or _is_own(env):
+        return
+    state, observation = jax.eval_shape(env.reset, jax.random.key(0))
+    _expect(env, "observation_dim", env.observation_dim, "reset gives an observation", observation)
+    _expect(env, "goal_dim", env.goal_dim, "achieved_goal gives a goal", jax.eval_shape(env.achieved_goal, observation))
+    _expect(env, "goal_dim", env.goal_dim, "task_goal gives a goal", jax.eval_shape(env.task_goal))
+    if isinstance(env, Restorable):
+        _expect(env, "state_dim", env.state_dim, "state_to_vector gives a vector", jax.eval_shape(env.state_to_vector, state))
+    try:
+        _, time_step = jax.eval_shape(env.step, state, jax.ShapeDtypeStruct((env.action_dim,), np.float32))
+    except (TypeError, ValueError) as error:
+        if "shape" not in str(error):
+            raise  # a mistake of another kind, whose place the traceback shows
+        raise UserError(
+            f"{env.name}: action_dim is {env.action_dim}, and step fails with an action of shape ({env.action_dim},){_place(env, error)}: "
+            f"{one_line(error)}"
+        ) from error
+    _expect(env, "observation_dim", env.observation_dim, "step gives an observation", time_step.observation)
+
+
+def check_expert(env: Environment, expert: Any) -> None:
+    """Makes sure that an expert gives actions of the length that the environment states.
+
+    Args:
+      env: one that is stepped in JAX; with others nothing is checked.
+      expert: with act(key, env, state); those of this package are not looked at.
+
+    Raises:
+      UserError: if it does not.
+    """
+    if not can_step(env) or _is_own(expert):
+        return
+    state, _ = jax.eval_shape(env.reset, jax.random.key(0))
+    action = jax.eval_shape(lambda key, begun: jnp.asarray(expert.act(key, env, begun)), jax.random.key(0), state)
+    _expect(env, "action_dim", env.action_dim, f"{type(expert).__name__}.act gives an action", action)
+
+
+def _expect(env: Environment, name: str, length: int, gives: str, found: Any) -> None:
+    """Raises a UserError unless what was found is a vector of the length that the environment states by that name."""
+    if getattr(found, "shape", None) != (length,):
+        shape = f"of shape {found.shape}" if hasattr(found, "shape") else f"that is no array but {type(found).__name__}"
+        raise UserError(f"{env.name}: {name} is {length}, and {gives} {shape}: mend the one or the other")
+
+
+def _is_own(thing: Any) -> bool:
+    return type(thing).__module__.startswith("hindrl_jax.")
+
+
+def _place(env: Environment, error: Exception) -> str:
+    """Where in the environment's own file something failed."""
+    file = inspect.getsourcefile(type(env))
+    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
+    return f" in line {lines[-1]} of {file}" if lines else ""
 
 
 def check_config(env: Environment, config: TrainConfig) -> None:

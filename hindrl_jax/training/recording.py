@@ -17,7 +17,7 @@ from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.steppers import HostStepped, Watchable
 from hindrl_jax.base.types import Array, Episodes
 from hindrl_jax.tasks.registry import task
-from hindrl_jax.training.checks import check_demonstrations
+from hindrl_jax.training.checks import check_demonstrations, check_dimensions, check_expert
 from hindrl_jax.training.devices import free_memory, seed_mesh
 from hindrl_jax.training.playing import player, plays_one_by_one
 
@@ -66,9 +66,12 @@ def record(key: Array, env: Environment, expert: Expert, num_demos: int, *, max_
       max_attempts: episodes to play before giving up; by default 100 times `num_demos`.
 
     Raises:
-      UserError: if `num_demos` is below 1, or the expert solves too few episodes, or the environment's back end is unusable.
+      UserError: if `num_demos` is below 1, or the expert solves too few episodes, or the environment's back end is unusable, or its dimensions or
+        the expert's actions are not what it states.
     """
     check_demonstrations(num_demos)
+    check_dimensions(env)
+    check_expert(env, expert)
     max_attempts = 100 * num_demos if max_attempts is None else max_attempts
     batch_size = 1 if plays_one_by_one(env) else max(num_demos, 16)
     needed, free = 4 * batch_size * env.horizon * (env.observation_dim + env.action_dim + state_dim(env)), free_memory(seed_mesh(jax.process_count()))

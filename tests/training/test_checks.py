@@ -1,14 +1,19 @@
 """What is refused before anything is computed, in a line that names what is missing and what to do."""
 
 import dataclasses
+import importlib
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
+import jax.numpy as jnp
 import pytest
 from host_env import HostCorridor
 from tiny import CONFIG, ENV
 from toy_env import Corridor
 
 import hindrl_jax as hindrl
+from hindrl_jax.tasks import registry
 from hindrl_jax.training.checks import check_config, check_trainable
 
 
@@ -75,6 +80,99 @@ def test_an_environment_that_cannot_be_stepped_many_at_once_is_refused():
         check_trainable(hindrl.make("ParameterizedReach", backend="robosuite"))
     with pytest.raises(hindrl.UserError, match="HostCorridor cannot be trained: it has neither reset and step in JAX, nor a stepper"):
         check_trainable(Unstepped())
+
+
+class WrongObservation(Corridor):
+    observation_dim = 4
+
+
+class WrongGoal(Corridor):
+    goal_dim = 2
+
+
+class WrongTaskGoal(Corridor):
+    def task_goal(self):
+        return jnp.zeros(2)
+
+
+class WrongState(Corridor):
+    state_dim = 2
+
+
+class WrongAction(Corridor):
+    """Its step needs three numbers."""
+
+    def step(self, state, action):
+        return super().step(state, action + jnp.zeros(3))
+
+
+class WrongStep(Corridor):
+    """Its observations grow."""
+
+    def step(self, state, action):
+        state, time_step = super().step(state, action)
+        return state, dataclasses.replace(time_step, observation=jnp.zeros(7))
+
+
+class NoArray(Corridor):
+    def achieved_goal(self, observation):
+        return {"position": observation[2:]}
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        (WrongObservation(), r"^Corridor: observation_dim is 4, and reset gives an observation of shape \(3,\): mend the one or the other$"),
+        (WrongGoal(), r"goal_dim is 2, and achieved_goal gives a goal of shape \(1,\)"),
+        (WrongTaskGoal(), r"goal_dim is 1, and task_goal gives a goal of shape \(2,\)"),
+        (WrongState(), r"state_dim is 2, and state_to_vector gives a vector of shape \(3,\)"),
+        (WrongAction(), r"action_dim is 2, and step fails with an action of shape \(2,\) in line \d+ of .*test_checks.py: add got"),
+        (WrongStep(), r"observation_dim is 3, and step gives an observation of shape \(7,\)"),
+        (NoArray(), r"goal_dim is 1, and achieved_goal gives a goal that is no array but dict"),
+    ],
+)
+def test_dimensions_are_what_the_environment_gives(env, message):
+    check_trainable(Corridor())
+    for refused in (lambda: check_trainable(env), lambda: hindrl.record_demonstrations(env, 1, expert=Walker())):
+        with pytest.raises(hindrl.UserError, match=message) as told:
+            refused()
+        assert "\n" not in str(told.value)
+
+
+@dataclasses.dataclass(frozen=True)
+class Walker:
+    length: int = 2
+
+    def act(self, key, env, state):
+        return jnp.ones(self.length)
+
+
+def test_an_expert_gives_actions_of_the_environment():
+    assert hindrl.record_demonstrations(Corridor(), 1, expert=Walker()).lengths.shape == (1,)
+    with pytest.raises(hindrl.UserError, match=r"action_dim is 2, and Walker.act gives an action of shape \(3,\)"):
+        hindrl.record_demonstrations(Corridor(), 1, expert=Walker(length=3))
+
+
+class Mistaken(Corridor):
+    def step(self, state, action):
+        return undefined_name  # noqa: F821
+
+
+def test_a_mistake_of_another_kind_keeps_its_traceback():
+    with pytest.raises(NameError, match="undefined_name"):
+        check_trainable(Mistaken())
+
+
+def test_the_tutorial_shows_the_line_that_one_meets(monkeypatch):
+    root = Path(__file__).parent.parent.parent
+    monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
+    monkeypatch.syspath_prepend(str(root / "examples"))
+    arm = importlib.import_module("planar_arm").PlanarArm
+    sys.modules.pop("planar_arm")  # whoever imports it next has it registered
+    monkeypatch.setattr(arm, "observation_dim", 4)
+    with pytest.raises(hindrl.UserError) as told:
+        check_trainable(arm())
+    assert f"\nhindrl: {told.value}\n" in (root / "docs" / "tutorial.md").read_text()
 
 
 class Unrestorable:
