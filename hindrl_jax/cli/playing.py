@@ -13,6 +13,7 @@ from rich.table import Table
 
 from hindrl_jax.cli.common import check_episodes, console, counted, episode_key, parse
 from hindrl_jax.cli.policies import PREFIX, run_directory
+from hindrl_jax.reporting.progress import ProgressBar
 from hindrl_jax.runs.reader import load_run
 from hindrl_jax.training.playing import plays_one_by_one
 
@@ -43,7 +44,10 @@ def evaluate(arguments: list[str]) -> None:
     if options.backend is not None:
         run = run.in_backend(options.backend)
     columns = (TextColumn("{task.completed}/{task.total} episodes"), BarColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not plays_one_by_one(run.spec.env)) as progress:
+    one_by_one = plays_one_by_one(run.spec.env)
+    with ProgressBar(console=console) as waiting, Progress(*columns, console=console, transient=True, disable=not one_by_one) as progress:
+        if not one_by_one:
+            waiting.wait("compiling, and playing")
         bar = progress.add_task("", total=options.episodes * len(run.spec.seeds))
         outcomes = run.evaluate(
             episodes=options.episodes,
@@ -89,6 +93,8 @@ def render(arguments: list[str]) -> None:
     ships = options.directory.startswith(PREFIX)  # and so its directory is the installation's
     path = options.to or (Path(f"{options.directory.removeprefix(PREFIX)}_{name}") if ships else Path(options.directory) / name)
     keys = jnp.stack([episode_key(options.episode + number) for number in range(options.episodes)])
-    solved = run.render(path, seed=options.seed, key=keys, noise=options.noise)
+    with ProgressBar(console=console) as waiting:
+        waiting.wait("compiling, playing and drawing")
+        solved = run.render(path, seed=options.seed, key=keys, noise=options.noise)
     single = f"the episode is {'solved' if solved else 'not solved'}"
     console.print(f"wrote {path}: {single if options.episodes == 1 else f'{solved} of {options.episodes} episodes are solved'}")

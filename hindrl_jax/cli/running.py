@@ -86,7 +86,13 @@ def run(spec: RunSpec, configs: Sequence[TrainConfig], writer: RunWriter | Sweep
     num_demos = int(spec.demos) if is_number(spec.demos) else 1
     check_demonstrations(num_demos)
     check_memory(spec.env, configs[0], len(spec.seeds) * len(configs), num_demos)
-    demonstrations = checkpoints.load_demonstrations() if resumes and checkpoints.has_demonstrations else demonstrations_of(spec)
+    with ProgressBar(console=console) as waiting:
+        if resumes and checkpoints.has_demonstrations:
+            demonstrations = checkpoints.load_demonstrations()
+        else:
+            if is_number(spec.demos) and writer is not None:
+                waiting.wait("recording demonstrations")
+            demonstrations = demonstrations_of(spec)
     num_seeds = len(spec.seeds)
     seeds = f"seed {spec.seeds[0]}" if num_seeds == 1 else f"{num_seeds} seeds from {spec.seeds[0]}"
     settings = f", {len(configs)} settings" if len(configs) > 1 else ""

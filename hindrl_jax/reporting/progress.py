@@ -19,8 +19,8 @@ _WIDTHS = (10, 30)  # the least and the most characters of the bar
 class ProgressBar:
     """A `report` of `fit`: `hindrl.fit(env, demonstrations, config, report=hindrl.ProgressBar())`.
 
-    A line stays for the evaluation at each tenth of the run; below them a bar moves, in a terminal or a notebook. A log file gets the lines alone,
-    without control characters. Nothing runs beside the training, so nothing is left behind when it is interrupted.
+    A line stays for the evaluation at each tenth of the run, and for the one that ended it; below them a bar moves, in a terminal or a notebook. A
+    log file gets the lines alone, without control characters. Nothing runs beside the training, so nothing is left behind when it is interrupted.
     """
 
     def __init__(self, *, lines: int = 10, console: Console | None = None):
@@ -38,15 +38,16 @@ class ProgressBar:
         self._began: tuple[int, float] | None = None  # steps done and seconds when learning began
         self._rows_seen: int | None = None
         self._lines_said = 0
+        self._last_is_said = True  # whether the newest evaluation has a line
 
     def __call__(self, result: Result) -> None:
         """Brings everything up to date."""
         tenths = math.floor(self._lines * result.steps_done / result.config.num_steps)
         if self._rows_seen is None or len(result.rows) < self._rows_seen:  # a training begins, or goes on after an interruption
-            self._began, self._rows_seen, self._lines_said = None, len(result.rows), tenths
+            self._began, self._rows_seen, self._lines_said, self._last_is_said = None, len(result.rows), tenths, True
         if len(result.rows) > self._rows_seen:
-            self._rows_seen = len(result.rows)
-            if tenths > self._lines_said:
+            self._rows_seen, self._last_is_said = len(result.rows), tenths > self._lines_said
+            if self._last_is_said:
                 self._lines_said = tenths
                 self.say(evaluation_line(result.rows[-len(result.seeds) :]))
         if result.final_success is None:
@@ -54,11 +55,17 @@ class ProgressBar:
                 self._began = (result.steps_done, result.train_seconds)
             self._draw(bar(result, self._began, width=self._console.width - 1, unicode="utf" in self._console.encoding.lower()))
         else:
+            if not self._last_is_said:  # it ended before its time
+                self._last_is_said = True
+                self.say(evaluation_line(result.rows[-len(result.seeds) :]))
             self.close()
 
     def wait(self, what: str) -> None:
-        """Shows what is being waited for in place of the bar; not in a log file."""
-        self._draw(Text(what))
+        """Shows what is being waited for: in place of the bar, or in a log file as a line. `fit` calls it before it compiles."""
+        if self._live or self._console.is_jupyter:
+            self._draw(Text(f"{what} ..."))
+        else:
+            self.say(f"{what} ...")
 
     def say(self, line: str) -> None:
         """Writes a line that stays, above the bar."""

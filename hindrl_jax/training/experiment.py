@@ -56,7 +56,8 @@ def fit(
       seeds: non-negative integers. A seed gives the same run whatever the others are, up to floating-point rounding. But an `action_hold` of None is
         chosen by the demonstrations of all of them, and with `stop_at` they all learn on until the last of them is done.
       report: called after compilation, several times between evaluations, after each evaluation, and at the end. Where it returns True
-        while the experiment learns, that ends: what was found so far is returned as usual.
+        while the experiment learns, that ends: what was found so far is returned as usual. Where it has a method `wait`, as `ProgressBar` does,
+        that is called with "compiling" before this begins, since it takes 10 s to minutes.
       restore: called before anything is computed with a result whose guidance, state and key are `jax.ShapeDtypeStruct`s. Where it returns
         what `report` was given at some time in an earlier call with the same arguments, the experiment goes on from there, and all that
         follows is the same, bit for bit; see `hindrl_jax.runs.checkpoints`. Where it returns None, the experiment begins. In environments that
@@ -86,6 +87,8 @@ def fit(
     tables = hold_demonstrations(tables, num_held, chunks=config.action_chunks)
     if config.quirks.misaligned_demo_actions and int(tables.lengths.min()) < 2:
         raise UserError("misaligned_demo_actions needs demonstrations of at least 2 steps: turn it off or record others")
+    if hasattr(report, "wait"):
+        report.wait("compiling")
     started = time.perf_counter()
     with contextlib.closing(programs_of(hold(env, num_held, chunks=config.action_chunks), configs, tables)) as programs:
         kept = nothing_kept(policy(programs.shapes["state"].agent, average=True).actor)

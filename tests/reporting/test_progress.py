@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import tiny
 from rich.console import Console
 
 import hindrl_jax as hindrl
@@ -54,7 +55,8 @@ def play(screen, **options):
 def test_a_log_file_gets_ten_plain_lines():
     written = play(console())
     assert not re.search(r"[^\x20-\x7e\n]", written)
-    lines = written.splitlines()
+    first, *lines = written.splitlines()
+    assert first == "compiling ..."
     assert [line.split()[0] for line in lines] == [f"{steps:,}" for steps in range(400, 4_001, 400)]
     assert lines[4] == "    2,000 steps    2,000 updates    20.0 s   success  38% (worst  25%)   length  50.0"
 
@@ -67,12 +69,12 @@ def test_what_sampled_actions_solve_stands_beside():
 def test_a_terminal_shows_the_lines_above_a_bar_that_goes_in_the_end():
     written = play(console(force_terminal=True, color_system=None, _environ={"TERM": "xterm"}))
     drawn = written.split(WIPE)
-    assert drawn[0] == "compiling"
+    assert drawn[0] == "compiling ..."
     assert max(len(part.split("\n")[-1]) for part in drawn) <= 79  # a bar that reaches the edge would wrap
     assert drawn[-1] == ""
     seen = [line.split(WIPE)[-1] for line in written.split("\n")]
     assert seen[-1] == ""
-    assert seen[:-1] == play(console()).splitlines()
+    assert seen[:-1] == play(console()).splitlines()[1:]
 
 
 def test_the_bar_says_how_far_how_good_how_fast_and_how_long():
@@ -87,7 +89,7 @@ def test_the_bar_says_how_far_how_good_how_fast_and_how_long():
 
 
 def test_bc_counts_updates():
-    assert play(console(), algo="bc").splitlines()[0] == "     400 updates     4.0 s   success   8% (worst   5%)   length  50.0"
+    assert play(console(), algo="bc").splitlines()[1] == "     400 updates     4.0 s   success   8% (worst   5%)   length  50.0"
     seed = dict(seed=0, final_success=1.0, episode_length=50.0, env_steps_to_95=0, updates_to_95=1_500, seconds_to_95=2.0)
     seed |= dict(returned_success=1.0, returned_length=49.0, returned_noise=0.0, returned_env_steps=0, returned_updates=1_000)
     screen = console()
@@ -117,6 +119,37 @@ def test_a_notebook_gets_one_display_that_changes(monkeypatch, capsys):
     assert "2,000/4,000 steps, success 38%" in shown[41]  # compiling, then a picture every 50 steps from 0
     assert shown[-1] == ""
     assert len(capsys.readouterr().out.splitlines()) == 10
+
+
+def test_the_evaluation_that_ends_a_run_before_its_time_has_a_line():
+    """At 2,100 of 4,000 steps: the last line was that of the fifth tenth."""
+    screen = console()
+    progress = hindrl.ProgressBar(console=screen)
+    for done in range(0, 2_101, 50):
+        progress(result(done))
+    for _ in range(2):
+        progress(result(2_100, finished=True))
+    assert [line.split()[0] for line in screen.file.getvalue().splitlines()] == ["400", "800", "1,200", "1,600", "2,000", "2,100"]
+    screen.file.truncate(0)
+    progress(result(500))  # another training, whose last evaluation has no line of its own here
+    progress(result(500, finished=True))
+    assert screen.file.getvalue().strip("\0") == ""
+
+
+def test_what_shows_a_training_is_told_that_it_is_being_compiled(monkeypatch):
+    class Compiling(Exception):
+        pass
+
+    def compile_(*given):
+        raise Compiling
+
+    monkeypatch.setattr("hindrl_jax.training.experiment.programs_of", compile_)
+    screen, demonstrations = console(), hindrl.record_demonstrations(tiny.ENV, 1)
+    with pytest.raises(Compiling):
+        hindrl.fit(tiny.ENV, demonstrations, tiny.CONFIG, report=hindrl.ProgressBar(console=screen))
+    assert screen.file.getvalue() == "compiling ...\n"
+    with pytest.raises(Compiling):
+        hindrl.fit(tiny.ENV, demonstrations, tiny.CONFIG, report=print)
 
 
 def test_an_interrupted_training_leaves_the_line_clean():
