@@ -22,9 +22,10 @@ from hindrl_jax.cli.signals import interrupts_that_last
 from hindrl_jax.tasks.registry import did_you_mean
 
 Command = Callable[[list[str]], None]
-COMMANDS: dict[str, Command | dict[str, Command]] = {
+COMMANDS: dict[str, Command | dict[str, Command]] = {  # in the order in which people come to need them
+    "policies": policies.show,
+    "envs": environments.show,
     "train": training.train,
-    "sweep": sweeping.sweep,
     "eval": playing.evaluate,
     "render": playing.render,
     "compare": comparison.compare,
@@ -35,11 +36,13 @@ COMMANDS: dict[str, Command | dict[str, Command]] = {
         "render": demonstrations.render,
         "convert": demonstrations.convert,
     },
+    "sweep": sweeping.sweep,
     "reproduce": reproduction.COMMANDS,
-    "envs": environments.show,
-    "policies": policies.show,
 }
-
+_GROUPS = {
+    "demos": "Record, inspect, draw, film or convert demonstrations.",
+    "reproduce": "Train by a plan: each option by itself, or the thesis's tables and figures.",
+}
 
 _STEPS = """\
 start with:
@@ -52,11 +55,16 @@ _COMPLETION = 'In bash, `eval "$(hindrl completion)"` has Tab complete commands,
 
 
 def _usage() -> str:
-    lines = [f"hindrl {__version__}: learn sparse-reward tasks from a handful of demonstrations", "", "commands:"]
-    for name, command in COMMANDS.items():
-        for words, function in [(name, command)] if callable(command) else [(f"{name} {sub}", f) for sub, f in command.items()]:
-            lines.append(f"  hindrl {words:<22}{function.__doc__}")
-    return "\n".join([*lines, "", _STEPS, "", "`hindrl COMMAND --help` explains a command, `hindrl --version` prints the version.", _COMPLETION])
+    lines = [f"hindrl {__version__}: learn sparse-reward tasks from a handful of demonstrations", "", _STEPS, "", "commands:"]
+    lines += [f"  hindrl {name:<11}{command.__doc__ if callable(command) else _GROUPS[name]}" for name, command in COMMANDS.items()]
+    return "\n".join([*lines, "", "`hindrl COMMAND --help` explains a command, `hindrl --version` prints the version.", _COMPLETION])
+
+
+def _usage_of(group: str, commands: dict[str, Command]) -> str:
+    """The commands that begin with the same word."""
+    width = max(map(len, commands)) + 2
+    lines = [f"  hindrl {group} {name:<{width}}{command.__doc__}" for name, command in commands.items()]
+    return "\n".join([f"hindrl {group}: {_GROUPS[group]}", "", *lines, "", f"`hindrl {group} COMMAND --help` explains a command."])
 
 
 def _find(arguments: list[str]) -> tuple[Command, list[str]]:
@@ -111,9 +119,11 @@ def main(arguments: list[str] | None = None) -> None:
         if arguments == ["completion"]:
             print(completion.script(COMMANDS), flush=True)
             return
-        if last in ("--help", "-h") and (not group or (len(group) == 1 and isinstance(COMMANDS.get(group[0]), dict))):
-            print(_usage(), flush=True)
-            return
+        if last in ("--help", "-h", "--help-all") and len(group) < 2:
+            commands = COMMANDS.get(group[0]) if group else None
+            if not group or isinstance(commands, dict):
+                print(_usage_of(group[0], commands) if isinstance(commands, dict) else _usage(), flush=True)
+                return
         with warnings.catch_warnings(), interrupts_that_last():
             warnings.showwarning = lambda message, *_, **__: _complain(f"warning: {message}")
             command, rest = _find(arguments)

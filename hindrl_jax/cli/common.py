@@ -14,9 +14,9 @@ import tyro
 from rich.console import Console
 
 from hindrl_jax.base.errors import UserError
-from hindrl_jax.cli.help_pages import full_page, groups_of, missing, nearest, short_page
+from hindrl_jax.cli.help_pages import Group, full_page, groups_of, missing, nearest, short_page
 from hindrl_jax.tasks.from_gymnasium import PREFIX
-from hindrl_jax.tasks.registry import TASKS, make
+from hindrl_jax.tasks.registry import TASKS, did_you_mean, make
 
 _TYRO = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
 ENV_HELP = "The environment; `hindrl envs` lists them. Any goal-conditioned one of Gymnasium is gymnasium:ID, as in gymnasium:FetchReach-v4."
@@ -115,14 +115,42 @@ def parse(arguments_class: type[Any], arguments: list[str], program: str, descri
         with contextlib.redirect_stderr(complaint):
             return tyro.cli(arguments_class, args=arguments, prog=program, config=_TYRO)
     except SystemExit:
-        said, lacking = _first_sentence(complaint.getvalue(), arguments_class), missing(arguments, groups_of(arguments_class))
-        if said.startswith("Missing") and lacking:
-            said = f"{program} needs {', '.join(lacking)}"
+        said = _in_our_words(_first_sentence(complaint.getvalue()), arguments, program, groups_of(arguments_class))
         raise UserError(f"{said} (see {program} --help)") from None
 
 
-def _first_sentence(complaint: str, arguments_class: type[Any]) -> str:
-    """The message of tyro's box, and the option that was probably meant. Where the terminal is not known to speak UTF-8, the box has no border."""
+_WANTED = {"INT": "a whole number", "FLOAT": "a number", "INT ...": "whole numbers", "FLOAT ...": "numbers", "PATH": "a path"}
+
+
+def _in_our_words(said: str, arguments: Sequence[str], program: str, groups: Sequence[Group]) -> str:
+    """What is wrong with the arguments, and what to do. Where tyro says something else than what is known here, what it says."""
+    values = {f"--{flag.name}": flag.values for group in groups for flag in group.flags}
+    flag = next((word.strip("':.,") for word in said.split() if word.strip("'").startswith("--")), "")
+    wanted = _WANTED.get(values.get(flag, ""), "a value")
+    given = " ".join([flag, *peek_all(arguments, flag.removeprefix("--"))])
+    if said.startswith("Unrecognized options: "):
+        unknown = said.removeprefix("Unrecognized options: ").split(", ")
+        flags = [word.partition("=")[0] for word in unknown if word.startswith("--")]
+        if not flags:
+            return f"{program} does not know what {' '.join(map(repr, unknown))} is for: values stand behind their options"
+        meant = nearest(flags[0], groups)
+        return f"{program} has no option {', '.join(flags)}" + (f" (did you mean {meant}?)" if meant else "")
+    if said.startswith("Missing"):
+        if f"'{flag}'" in said and flag in values:
+            return f"{flag} needs {wanted} after it"
+        lacking = missing(arguments, groups)
+        return f"{program} needs {', '.join(lacking)}" if lacking else said
+    if said.startswith("Error parsing --") and wanted != "a value":
+        return f"{given} is not usable: give {wanted}"
+    choices = re.search(r"^invalid choice '(.*)' for argument .*Expected one of \((.*?),?\)\.$", said)
+    if choices:
+        known = re.findall(r"'([^']*)'", choices[2])
+        return f"{flag} {choices[1]} is not usable{did_you_mean(choices[1], known)}: choose one of {', '.join(known)}"
+    return said
+
+
+def _first_sentence(complaint: str) -> str:
+    """The message of tyro's box. Where the terminal is not known to speak UTF-8, the box has no border."""
     bordered = "│" in complaint
     lines = [line.strip("│ ") for line in complaint.splitlines() if line.startswith("│") or not bordered]
     sections: list[list[str]] = [[]]
@@ -132,10 +160,7 @@ def _first_sentence(complaint: str, arguments_class: type[Any]) -> str:
         elif line:
             sections[-1].append(line)
     message, *_ = sections if bordered else sections[1:]  # without a border, the title is a section of its own
-    text = re.sub(r"^Error parsing (?!-)\S+: ", "", " ".join(message))
-    unknown = re.search(r"--\S+", text) if text.startswith("Unrecognized") else None
-    meant = nearest(unknown[0], groups_of(arguments_class)) if unknown else None
-    return f"{text} (did you mean {meant}?)" if meant else text
+    return re.sub(r"^Error parsing (?!-)\S+: ", "", " ".join(message))
 
 
 def counted(number: int, noun: str) -> str:

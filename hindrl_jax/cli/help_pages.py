@@ -237,6 +237,7 @@ def nearest(unknown: str, groups: Sequence[Group]) -> str | None:
     if _SYNONYMS.get(wanted) in names:
         return f"--{_SYNONYMS[wanted]}"
     initials = [name for name in names if "".join(word[0] for word in name.split("-")) == wanted]
+    nearly = difflib.get_close_matches(wanted, names, n=1, cutoff=0.85)  # a letter too few or too many
     words = [name for name in names if wanted in name.split("-")]
-    close = initials or words or difflib.get_close_matches(wanted, names, n=1) or [name for name in names if name.startswith(wanted)]
+    close = initials or nearly or words or difflib.get_close_matches(wanted, names, n=1) or [name for name in names if name.startswith(wanted)]
     return f"--{close[0]}" if close else None

@@ -58,6 +58,18 @@ def test_an_interrupt_does_not_outlive_its_command(monkeypatch):
         (["train", "--lr", "1"], "did you mean --learning-rate?"),
         (["train", "--lr=1"], "did you mean --learning-rate?"),
         (["train", "--total_timesteps", "1"], "did you mean --steps?"),
+        (["train", "--demo", "1"], "hindrl train has no option --demo (did you mean --demos?) (see hindrl train --help)"),
+        (["train", "--demo=1"], "hindrl train has no option --demo (did you mean --demos?) (see"),
+        (["train", "--step", "5"], "did you mean --steps?"),
+        (["train", "--foo", "1", "--bar"], "hindrl train has no option --foo, --bar (see"),
+        (["train", "--steps", "abc"], "hindrl: --steps abc is not usable: give a whole number (see"),
+        (["train", "--steps=2.5"], "hindrl: --steps 2.5 is not usable: give a whole number (see"),
+        (["train", "--stop-at", "x"], "hindrl: --stop-at x is not usable: give a number (see"),
+        (["train", "--net-arch", "4", "x"], "hindrl: --net-arch 4 x is not usable: give whole numbers (see"),
+        (["train", "--bc-loss", "squard"], "--bc-loss squard is not usable (did you mean 'squared'?): choose one of relative, squared, norm (see"),
+        (["train", "--steps"], "hindrl: --steps needs a whole number after it (see"),
+        (["train", "--demos"], "hindrl: --demos needs a value after it (see"),
+        (["train", "--seeds", "2", "3"], "hindrl train does not know what '3' is for: values stand behind their options (see"),
         (["train", "--n-envs", "1"], "did you mean --num-envs?"),
         (["train", "--resets", "1"], "did you mean --agent-resets?"),
         (["eval"], "hindrl eval needs DIRECTORY"),
@@ -99,11 +111,27 @@ def test_envs_lists_every_environment(capsys):
 
 
 def test_without_arguments_it_says_what_there_is(capsys):
-    cli.main([])
-    printed = capsys.readouterr().out
-    assert "hindrl train" in printed
-    assert "hindrl demos record" in printed
-    assert "hindrl COMMAND --help" in printed
+    pages = []
+    for arguments in ([], ["--help"]):
+        cli.main(arguments)
+        pages.append(capsys.readouterr().out)
+    assert pages[0] == pages[1]
+    lines = pages[0].splitlines()
+    assert len(lines) <= 25
+    assert max(map(len, lines)) <= 100
+    listed = [line.split()[1] for line in lines if line.startswith("  hindrl ")]
+    assert set(listed) == set(cli.COMMANDS)
+    starts = listed.index("policies")  # after the three commands to start with
+    assert listed[starts:] == ["policies", "envs", "train", "eval", "render", "compare", "demos", "sweep", "reproduce"]
+    assert "hindrl COMMAND --help" in pages[0]
+
+
+@pytest.mark.parametrize("group", [name for name, command in cli.COMMANDS.items() if isinstance(command, dict)])
+def test_a_group_of_commands_lists_its_own(group, capsys):
+    cli.main([group, "--help"])
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[2] for line in lines if line.startswith(f"  hindrl {group} ")] == list(cli.COMMANDS[group])
+    assert not any(line.startswith("  hindrl train") for line in lines)
 
 
 def test_it_says_its_version(capsys):
