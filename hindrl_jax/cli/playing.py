@@ -12,9 +12,9 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from hindrl_jax.cli.common import check_episodes, console, counted, episode_key, parse
-from hindrl_jax.cli.policies import PREFIX, run_directory
 from hindrl_jax.reporting.progress import ProgressBar
 from hindrl_jax.runs.reader import load_run
+from hindrl_jax.runs.shipped import PREFIX
 from hindrl_jax.training.playing import plays_one_by_one
 
 
@@ -40,7 +40,7 @@ def evaluate(arguments: list[str]) -> None:
     """Play fresh episodes with the policies of a run."""
     options = parse(Eval, arguments, "hindrl eval")
     check_episodes(options.episodes, "play")
-    run = load_run(run_directory(options.directory), last=options.last)
+    run = load_run(options.directory, last=options.last)
     if options.backend is not None:
         run = run.in_backend(options.backend)
     columns = (TextColumn("{task.completed}/{task.total} episodes"), BarColumn(), TimeRemainingColumn())
@@ -88,7 +88,7 @@ def render(arguments: list[str]) -> None:
     """Film episodes of a run's policy."""
     options = parse(Render, arguments, "hindrl render")
     check_episodes(options.episodes, "film")
-    run = load_run(run_directory(options.directory), last=options.last)
+    run = load_run(options.directory, last=options.last)
     name = f"episode_{options.episode}_seed_{run.spec.seeds[0] if options.seed is None else options.seed}.gif"
     ships = options.directory.startswith(PREFIX)  # and so its directory is the installation's
     path = options.to or (Path(f"{options.directory.removeprefix(PREFIX)}_{name}") if ships else Path(options.directory) / name)

@@ -25,6 +25,7 @@ from hindrl_jax.core.goals import GoalTable
 from hindrl_jax.core.holding import hold
 from hindrl_jax.core.inputs import InputScale
 from hindrl_jax.plotting.films import check_film, save_film, save_pictures
+from hindrl_jax.runs.shipped import run_directory
 from hindrl_jax.runs.spec import CONFIG, PARAMETERS, RunSpec, read_spec
 from hindrl_jax.tasks.registry import checked
 from hindrl_jax.training.playing import TrainedPolicies
@@ -162,13 +163,13 @@ def load_run(path: str | os.PathLike[str], *, last: bool = False) -> Run:
     """Reads a run's directory.
 
     Args:
-      path: the directory.
+      path: the directory; or "policy:FixedParameterizedReach", a trained policy that comes with the package (`hindrl policies` lists them).
       last: take the policies at the end of the run, instead of the best that each seed has seen.
 
     Raises:
-      UserError: if it is not the directory of a finished run.
+      UserError: if it is not the directory of a finished run, or there is no such policy.
     """
-    path = Path(path)
+    path = run_directory(path)
     spec = read_spec(path)
     file = path / PARAMETERS
     if not file.exists():

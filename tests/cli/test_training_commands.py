@@ -15,10 +15,10 @@ from toy_env import Corridor, corridor_demonstrations
 
 import hindrl_jax as hindrl
 from hindrl_jax import cli
-from hindrl_jax.cli.policies import shipped
 from hindrl_jax.cli.train_options import parse_train
 from hindrl_jax.cli.training import advice, said_of_never
 from hindrl_jax.runs.reader import load_run
+from hindrl_jax.runs.shipped import shipped
 from hindrl_jax.runs.spec import RunSpec
 from hindrl_jax.tasks import registry
 from hindrl_jax.tasks.presets import preset

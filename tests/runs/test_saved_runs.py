@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+from pathlib import Path
 
 import chex
 import jax
@@ -13,6 +14,7 @@ from tiny import CONFIG, ENV
 import hindrl_jax as hindrl
 from hindrl_jax.core.agent import policy
 from hindrl_jax.plotting import films
+from hindrl_jax.runs.shipped import shipped
 
 
 @pytest.fixture(scope="module")
@@ -85,3 +87,15 @@ def test_damaged_parameters_are_refused(saved, tmp_path):
     file.unlink()
     with pytest.raises(hindrl.UserError, match="did not finish"):
         hindrl.load_run(tmp_path)
+
+
+def test_policies_that_come_with_the_package_are_read_by_name(tmp_path, monkeypatch):
+    run = hindrl.load_run("policy:FixedGridPickAndPlace")
+    assert run.path == shipped()["FixedGridPickAndPlace"]
+    assert run.spec.env == hindrl.make("FixedGridPickAndPlace")
+    with pytest.raises(hindrl.UserError, match=r"no policy 'FixedGrid' comes with hindrl_jax.*: choose one of BringNear, "):
+        hindrl.load_run("policy:FixedGrid")
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(run.path, tmp_path / "policy:mine")
+    for own in (Path("policy:mine"), "./policy:mine", str(tmp_path / "policy:mine")):
+        assert hindrl.load_run(own).spec == run.spec
