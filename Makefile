@@ -14,7 +14,7 @@ NEWEST_PIP = $(subst .venv,.venv-newest,$(PIP)) --upgrade --upgrade-strategy eag
 NEWEST_EXTRAS = .[minari,tensorboard,video]
 NEWEST_TOOLS = pytest pytest-xdist hypothesis ipython
 
-.PHONY: train test test-newest test-versions test-slow test-fuzz test-interop coverage lint docs check-docs package bench clean
+.PHONY: train test test-newest test-versions test-slow test-fuzz test-interop coverage lint docs notebooks check-docs package bench clean
 
 train: .venv/.installed  ## one demonstration, one seed, until it is solved: about two minutes with the installation
 	.venv/bin/hindrl train --env FixedGridPickAndPlace --algo hindrl --demos 1 --seed 2 --stop-at 0.98 --out runs/quickstart --overwrite
@@ -49,6 +49,9 @@ lint: .venv/.installed-test
 docs: .venv/.installed-test  ## site/index.html; a warning is an error
 	.venv/bin/python docs/generate.py
 	NO_MKDOCS_2_WARNING=1 .venv/bin/python -m mkdocs build --strict
+
+notebooks: .venv/.installed-test  ## runs them at full size and keeps their outputs; needed after a change of their code
+	.venv/bin/python docs/execute_notebooks.py
 
 check-docs: docs  ## the site in a browser without a screen, at two widths: what sticks out, leads nowhere or does not load; needs chromium
 	.venv/bin/python docs/check_site.py

@@ -1,6 +1,7 @@
 """Writes docs/generated/: the pages that come from elsewhere in the project, so that they cannot go stale. `make docs` runs it first.
 
-The command line's page is what each command answers to --help-all; notebooks become pages without their outputs, since none are stored.
+The command line's page is what each command answers to --help-all; notebooks become pages, with what they show where that is stored
+(docs/execute_notebooks.py).
 
 It is a hook of mkdocs, too. The pages of docs/ are also read as they stand, in a checkout or where it is hosted, so they link to the project's files:
 to `../notebooks/01_quickstart.ipynb`, or `../hindrl_jax/core`. On the site, such a link leads to the page that is made of the file.
@@ -8,6 +9,7 @@ to `../notebooks/01_quickstart.ipynb`, or `../hindrl_jax/core`. On the site, suc
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import io
 import json
@@ -36,14 +38,15 @@ LINK = re.compile(r"(?<!!)\[([^\]]*)\]\(([^)\s]*)\)")
 def main() -> None:
     """Writes all of them, and removes what is no longer made."""
     OUT.mkdir(exist_ok=True)
-    pages = {name: page(ROOT / source, links) for name, (source, links) in PAGES.items()}
-    pages |= {path.with_suffix(".md").name: notebook(path) for path in sorted((ROOT / "notebooks").glob("*.ipynb"))}
+    pages: dict[str, str | bytes] = {name: page(ROOT / source, links) for name, (source, links) in PAGES.items()}
+    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        pages |= notebook(path)
     pages["command-line.md"] = command_line()
     for path in OUT.iterdir():
         if path.name not in pages:
             path.unlink()
-    for name, text in pages.items():
-        (OUT / name).write_text(text)
+    for name, content in pages.items():
+        (OUT / name).write_bytes(content if isinstance(content, bytes) else content.encode())
 
 
 def page(source: Path, links: dict[str, str]) -> str:
@@ -101,17 +104,27 @@ def pages_of_modules() -> dict[str, str]:
     return {module: f"api/{path.name}" for path in pages for module in re.findall(r"^::: (\S+)$", path.read_text(), re.MULTILINE)}
 
 
-def notebook(path: Path) -> str:
-    """A notebook as Markdown: its text, and its code in fences."""
-    cells = []
+def notebook(path: Path) -> dict[str, str | bytes]:
+    """A notebook as Markdown, and its pictures, by the names of their files: its text, its code in fences, and what that has shown."""
+    parts: list[str] = []
+    pictures: dict[str, str | bytes] = {}
     for cell in json.loads(path.read_text())["cells"]:
         text = "".join(cell["source"])
-        cells.append(f"```python\n{text}\n```" if cell["cell_type"] == "code" else text)
-    title, *rest = cells
-    where = f'!!! note ""\n    This is `notebooks/{path.name}`, without its pictures: run it to see them, '
-    where += "with `.venv/bin/pip install notebook` and `.venv/bin/jupyter notebook notebooks` after `make train`."
+        parts.append(f"```python\n{text}\n```" if cell["cell_type"] == "code" else text)
+        for output in cell.get("outputs", []):
+            if output["output_type"] == "stream":
+                parts.append(f"```text\n{''.join(output['text']).rstrip()}\n```")
+            for kind, content in output.get("data", {}).items():
+                if kind.startswith("image/"):
+                    name = f"{path.stem}_{len(pictures)}.{kind.removeprefix('image/')}"
+                    pictures[name] = base64.b64decode("".join(content))
+                    parts.append(f"![What the code above shows]({name})")
+    title, *rest = parts
+    how = "with `.venv/bin/pip install notebook` and `.venv/bin/jupyter notebook notebooks` after `make train`."
+    seen = "" if pictures else ", without its pictures"
+    where = f'!!! note ""\n    This is `notebooks/{path.name}`{seen}: run it {"yourself" if pictures else "to see them"}, {how}'
     # Links between notebooks are links between their pages here.
-    return re.sub(r"\((\d\d_\w+)\.ipynb\)", r"(\1.md)", "\n\n".join([title, where, *rest]) + "\n")
+    return {f"{path.stem}.md": re.sub(r"\((\d\d_\w+)\.ipynb\)", r"(\1.md)", "\n\n".join([title, where, *rest]) + "\n"), **pictures}
 
 
 def command_line() -> str:
