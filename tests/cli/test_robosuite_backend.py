@@ -122,7 +122,7 @@ def test_a_device_needs_a_robot(tmp_path, capsys):
     out = tmp_path / "demos.hdf5"
     arguments = ["demos", "record", "--device", "keyboard", "--demos", "1", "--out", out]
     assert "GridPickAndPlace has none" in refusal(capsys, *arguments, "--env", "GridPickAndPlace")
-    assert "invalid choice" in refusal(capsys, *arguments, "--env", COARSE.name, "--device", "joystick")
+    assert "--device joystick is not usable: choose one of " in refusal(capsys, *arguments, "--env", COARSE.name, "--device", "joystick")
     assert "drop --backend mjx" in refusal(capsys, *arguments, "--env", COARSE.name, "--backend", "mjx")
     assert "expert's options" in refusal(capsys, *arguments, "--env", COARSE.name, "--randomness-scale", "0.05")
 

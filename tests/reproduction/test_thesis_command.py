@@ -160,8 +160,8 @@ def test_the_original_can_be_trained(tmp_path):
     ("arguments", "message"),
     [
         (["table-5.4"], "'table-5.4' is not a command of 'hindrl reproduce' (did you mean 'table-5.2'?)"),
-        (["figure-5.2", "--recipe", "ours"], "invalid choice"),
-        (["figure-5.2", "--scale", "huge"], "invalid choice"),
+        (["figure-5.2", "--recipe", "ours"], "--recipe ours is not usable: choose one of default, "),
+        (["figure-5.2", "--scale", "huge"], "--scale huge is not usable: choose one of quick, "),
         (["figure-5.2", "--seeds", "0"], "--seeds 0 is too few"),
         (["figure-5.2", "--seed", "-1"], "--seed -1 is not usable"),
     ],
