@@ -26,6 +26,7 @@ CONFIG = TrainConfig(
         top_quantiles_to_drop_per_net=0,
         target_update_rate=0.1,
         actor_average_span=0.25,
+        relative_value=False,
         initial_alpha=1e-4,
         target_entropy=-50.0,
         final_target_entropy=None,

@@ -42,13 +42,16 @@ class AgentConfig:
     actor_average_span: float = 0.25
     """Share of the gradient steps so far that the actor's running average spans, which evaluations and the saved policy use: it moves by
     1 / (1 + span * steps), less and less. With 0 it is the actor itself."""
-    initial_alpha: float = 0.002
+    relative_value: bool = True
+    """Divide the value in the actor's loss, row by row, by itself, or by 0.01 where it is less: as if the actor climbed the value's logarithm. One
+    step lost then weighs alike near the reward and far from it. The entropy is then in other units than rewards, and the targets leave it out."""
+    initial_alpha: float = 0.02
     """Entropy coefficient at the start; it is tuned automatically from there."""
     target_entropy: float = -1.0
     """Entropy that the automatic tuning aims at, in nats per action dimension; SAC's rule is -1."""
     final_target_entropy: float | None = -2.0
     """Where the target entropy has moved, linearly, by the end of the run; None keeps it constant."""
-    bc_weight: float = 0.05
+    bc_weight: float = 0.1
     """Weight of the behaviour cloning loss on demonstration rows (lambda_BC of the thesis)."""
     q_filter: Literal["off", "hard", "smooth"] = "off"
     """Clone only the demonstrated actions that the critics value above the policy's own (hard; Nair et al., 2018, eq. 4), or each in proportion to

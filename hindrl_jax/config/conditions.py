@@ -33,7 +33,7 @@ CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
         "max_demo_ratio reach_zero relabelled_per_original hindrl_sampling_strategy union_sampling_ratio intersection_goals "
         "n_step gamma bootstrap_past_relabelled_goals timeouts_are_terminal "
         "achieved_goal_ratio clip_targets num_critics num_target_critics num_quantiles top_quantiles_to_drop_per_net "
-        "layer_norm target_update_rate initial_alpha target_entropy final_target_entropy bc_weight agent_resets num_envs "
+        "layer_norm target_update_rate initial_alpha relative_value target_entropy final_target_entropy bc_weight agent_resets num_envs "
         "updates_per_iteration learning_starts buffer_size demo_reset_ratio demo_reset_curriculum",
         lambda c: c.learns_from_rollouts,
         "behaviour cloning does not use it: choose another algo",

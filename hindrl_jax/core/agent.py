@@ -3,7 +3,8 @@
 One `update` serves TQCfD, HinDRL and Smooth HinDRL, which differ only in the batch they are given; `update_bc` is the BC baseline, on the
 same actor. Differences from the TQC paper (Kuznetsov et al., 2020): the loss is averaged, not summed, over quantiles (as in sb3-contrib,
 which the thesis used), and the discount comes with each transition, so that n-step returns and termination need no special case. By default
-also: inputs encoded at two scales, targets clipped to what returns can be, and a running average of the actor for evaluation.
+also: inputs encoded at two scales, targets clipped to what returns can be, an actor that climbs the value relative to its size, and a running
+average of the actor for evaluation.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from hindrl_jax.core.schedules import Schedule
 
 Metrics = dict[str, Array]
 
+_LEAST_VALUE = 0.01  # values below it count as this much where the actor climbs them relative to their size
 _ADAM = optax.scale_by_adam()  # the step size is applied apart, since it may be an array, in sweeps
 
 
@@ -113,9 +115,9 @@ def update(key: Array, state: AgentState, batch: Transition, schedule: Schedule,
     """One gradient step of critics, actor and entropy coefficient, then one move of the target networks and of the averaged actor.
 
     Critic: quantile Huber loss towards the truncated atoms of r + discount (Z' - alpha log pi(a' | s')); for algorithms without quantiles the
-      squared error to r + discount (min Q' - alpha log pi(a' | s')).
+      squared error to r + discount (min Q' - alpha log pi(a' | s')). With `relative_value` without alpha, which is then in other units.
     Actor: mean(alpha log pi - value(s, a_pi)) + bc_weight * behaviour cloning loss; the value is the mean over critics and quantiles (tqc), or the
-      least critic's (sac; with REDQ's subsets the mean over critics).
+      least critic's (sac; with REDQ's subsets the mean over critics). With `relative_value` each row's is divided by itself, a constant.
 
     Args:
       key: random key.
@@ -169,7 +171,7 @@ def _prepare(key: Array, state: AgentState, batch: Transition, config: TrainConf
 def _targets(state: AgentState, target_critics: Params, config: TrainConfig, block: _Columns) -> Array:
     """What the critics of each column are moved towards: (M, B) target atoms, or (1, B) without quantiles."""
     next_action, log_prob = apply_actor(state.actor, block.next_inputs, config.agent, action_dim=block.action.shape[0]).at(block.next_noise)
-    entropy_bonus = -jnp.exp(state.log_alpha) * log_prob
+    entropy_bonus = jnp.zeros_like(log_prob) if config.agent.relative_value else -jnp.exp(state.log_alpha) * log_prob
     if state.imitation is not None:
         next_action, is_own = _better(next_action, state.imitation, target_critics, block.next_inputs, config)
         entropy_bonus = jnp.where(is_own, entropy_bonus, 0.0)  # the imitating policy is not random
@@ -229,11 +231,12 @@ def _actor_gradient(state: AgentState, schedule: Schedule, config: TrainConfig, 
     def loss(actor: Params) -> tuple[Array, Metrics]:
         distribution = apply_actor(actor, block.inputs, agent, action_dim=block.action.shape[0])
         action, log_prob = distribution.at(block.noise)
-        value, entropy = jnp.mean(_value(state.critics, block.inputs, action, config)), -jnp.mean(log_prob)
+        values, entropy = _value(state.critics, block.inputs, action, config), -jnp.mean(log_prob)
+        climbed = values / jax.lax.stop_gradient(jnp.maximum(values, _LEAST_VALUE)) if agent.relative_value else values
         weight = _cloning_weight(state.critics, block, distribution.mode, config)
         bc = behaviour_cloning(distribution.mode if quirks.bc_action == "mean" else action, block.action, weight, form=quirks.bc_loss)
-        total = -jnp.exp(state.log_alpha) * entropy - value + agent.bc_weight * bc
-        return total, {"actor/loss": total, "actor/bc_loss": bc, "actor/value": value, "actor/entropy": entropy}
+        total = -jnp.exp(state.log_alpha) * entropy - jnp.mean(climbed) + agent.bc_weight * bc
+        return total, {"actor/loss": total, "actor/bc_loss": bc, "actor/value": jnp.mean(values), "actor/entropy": entropy}
 
     return jax.grad(loss, has_aux=True)(state.actor)
 

@@ -39,7 +39,14 @@ RECIPE = TrainConfig(
     batch=BatchConfig(max_demo_ratio=0.25),
     goal=GoalConfig(epsilon_steps=0),
     agent=AgentConfig(
-        net_arch=(64, 64, 64, 64), layer_norm=False, clip_targets=False, target_entropy=-0.2, final_target_entropy=-2.0, bc_weight=0.01
+        net_arch=(64, 64, 64, 64),
+        layer_norm=False,
+        clip_targets=False,
+        relative_value=False,
+        initial_alpha=0.002,
+        target_entropy=-0.2,
+        final_target_entropy=-2.0,
+        bc_weight=0.01,
     ),
     quirks=QuirksConfig(bc_loss="squared"),
 )

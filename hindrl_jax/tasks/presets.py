@@ -87,8 +87,9 @@ def _default(algo: Algorithm, env: Environment) -> TrainConfig:
     """The project's own recipe."""
     goal = _goals(env)
     if algo == "bc":
-        agent = AgentConfig(net_arch=(64, 64))
-        return TrainConfig(algo="bc", steps=4_000, action_hold=1, eval_every=1_000, batch=BatchConfig(n_step=1), goal=goal, agent=agent)
+        # Two wide layers imitate better than four narrow ones, and soon: on cables 1,000 gradient steps are best (docs/cables.md).
+        agent = AgentConfig(net_arch=(256, 256))
+        return TrainConfig(algo="bc", steps=1_500, eval_every=250, batch=BatchConfig(n_step=1), goal=goal, agent=agent)
     return TrainConfig(goal=goal, batch=_batch(env))
 
 
@@ -127,8 +128,8 @@ def _rounded_down(value: float) -> float:
     return float(decimal.Context(prec=4, rounding=decimal.ROUND_FLOOR).create_decimal(str(value)))
 
 
-_FRAMEWORK: dict[str, Any] = dict(input_encoding="raw", actor_average_span=0.0)
-"""How the networks of the thesis's framework are fed and evaluated."""
+_FRAMEWORK: dict[str, Any] = dict(input_encoding="raw", actor_average_span=0.0, relative_value=False)
+"""How the networks of the thesis's framework are fed, trained and evaluated."""
 
 
 def _rlpd(algo: Algorithm, env: Environment) -> TrainConfig:

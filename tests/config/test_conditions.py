@@ -89,6 +89,7 @@ VALUES = {
     "top_quantiles_to_drop_per_net": (0, 1),
     "target_update_rate": (0.1, 0.2),
     "actor_average_span": (0.5, 1.0),
+    "relative_value": (False, True),
     "initial_alpha": (0.1, 0.2),
     "target_entropy": (-3.0, -5.0),
     "final_target_entropy": (-4.0, -5.0),

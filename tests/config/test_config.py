@@ -101,6 +101,7 @@ BAD = [
     (AgentConfig, "top_quantiles_to_drop_per_net", [-1, AgentConfig().num_quantiles]),
     (AgentConfig, "target_update_rate", [0.0, 1.1]),
     (AgentConfig, "actor_average_span", [-0.1]),
+    (AgentConfig, "relative_value", [1]),
     (AgentConfig, "initial_alpha", [0.0]),
     (AgentConfig, "target_entropy", [float("nan"), "auto"]),
     (AgentConfig, "final_target_entropy", [float("nan")]),

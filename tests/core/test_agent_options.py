@@ -9,6 +9,7 @@ import pytest
 from probe import (
     ACTIONS,
     CONFIG,
+    SCHEDULE,
     B,
     fresh_agent,
     last,
@@ -181,6 +182,35 @@ def test_weight_of_cloning_by_hand():
         metrics = one_update(jax.random.key(0), start, batch, with_agent(bc_weight=weight))[1]
         losses.append(float(metrics["actor/loss"]))
     np.testing.assert_allclose(losses[1] - losses[0], 2.0 * metrics["actor/bc_loss"], rtol=1e-3)
+
+
+def test_relative_value_weighs_every_row_by_its_own_size(monkeypatch):
+    given = np.where(np.arange(B) % 2, 0.5, 0.002)  # the second is below the least size, 0.01
+
+    def value(critics, inputs, action, config):
+        return jnp.asarray(given, jnp.float32) + action[0] - jax.lax.stop_gradient(action[0])
+
+    monkeypatch.setattr(agents, "_value", value)
+    start = fresh_agent(jax.random.key(0)).replace(log_alpha=jnp.asarray(-30.0))
+    start = start.replace(actor=with_constant_action(start.actor, 0.6))
+    gradient, metrics = agents._actor_gradient(start, SCHEDULE, with_agent(relative_value=True), columns())
+    np.testing.assert_allclose(metrics["actor/loss"], -0.5 * (1.0 + 0.2), atol=1e-5)
+    np.testing.assert_allclose(metrics["actor/value"], 0.5 * (0.5 + 0.002), rtol=1e-5)
+    # Its gradient is that of the logarithm: d(v / |v|) = dv / v, here dv = da, and a = tanh m has the derivative 1 - 0.6^2 = 0.64.
+    np.testing.assert_allclose(gradient["params"]["Dense_1"]["bias"][0], -0.64 * 0.5 * (1 / 0.5 + 1 / 0.01), rtol=1e-5)
+
+
+@pytest.mark.parametrize("base", BASES)
+def test_targets_leave_entropy_out_where_its_weight_is_in_other_units(base):
+    # The critics are constant, and rewards 0: by hand a target is 0.7 times their value, plus the entropy where it counts.
+    state = fresh_agent(jax.random.key(0), BASES[base]).replace(log_alpha=jnp.asarray(0.0))
+    critics = with_constant_critics(state, (0.5, 0.5), target=True).target_critics
+    block = columns(discount=jnp.full(B, 0.7))
+    relative, absolute = (
+        agents._targets(state, critics, with_agent(BASES[base], relative_value=relative_value), block) for relative_value in (True, False)
+    )
+    np.testing.assert_allclose(relative, np.full(relative.shape, 0.35), rtol=1e-5)
+    assert np.abs(absolute - 0.35).min() > 0.01
 
 
 def test_with_subsets_sac_climbs_the_mean_of_all_critics():
