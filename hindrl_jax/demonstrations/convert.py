@@ -89,7 +89,7 @@ def load(source: str, env: Environment, *, num_demos: int | None = None) -> Epis
         return load_demonstrations(source, env, num_demos=num_demos)
     found = open_source(source)
     if isinstance(found, ForeignRecording):
-        if found.env_name.startswith(minari.GYMNASIUM) and found.env_name != env.name:
+        if found.env_name.startswith(minari.GYMNASIUM) and found.env_name.rpartition(":")[2] != env.name.rpartition(":")[2]:  # modules apart
             raise UserError(f"{source}: was recorded in {found.env_name}, not in {env.name}; train in the former")
         try:
             found = understand(found, source, env=None if found.env_name in TASKS else env)
