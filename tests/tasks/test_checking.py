@@ -29,7 +29,7 @@ EXAMPLES = Path(__file__).parent.parent.parent / "examples"
         FixedGridPickAndPlace(num_objects=1, horizon=40),
         FixedParameterizedReach(horizon=8),
         ParameterizedReach(horizon=8),
-        pytest.param(BringNear(horizon=3), marks=pytest.mark.slow),  # minutes to compile
+        pytest.param(BringNear(horizon=3), marks=pytest.mark.slow),  # 13 s of one core each
         pytest.param(CableInsertion(horizon=3), marks=pytest.mark.slow),
     ],
     ids=lambda env: env.name,
