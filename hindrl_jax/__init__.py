@@ -28,6 +28,7 @@ _EXPORTS = {
     "TimeStep": "hindrl_jax.base.types",
     "UserError": "hindrl_jax.base.errors",
     "WandbReporter": "hindrl_jax.reporting.reporters",
+    "check_environment": "hindrl_jax.tasks.checking",
     "fit": "hindrl_jax.training.experiment",
     "load_demonstrations": "hindrl_jax.demonstrations.hdf5",
     "load_run": "hindrl_jax.runs.reader",
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
     from hindrl_jax.runs.checkpoints import Checkpoints as Checkpoints
     from hindrl_jax.runs.reader import load_run as load_run
     from hindrl_jax.runs.writer import save_run as save_run
+    from hindrl_jax.tasks.checking import check_environment as check_environment
     from hindrl_jax.tasks.presets import preset as preset
     from hindrl_jax.tasks.registry import make as make
     from hindrl_jax.tasks.registry import register as register

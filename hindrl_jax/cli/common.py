@@ -19,7 +19,7 @@ from hindrl_jax.tasks.from_gymnasium import PREFIX
 from hindrl_jax.tasks.registry import TASKS, did_you_mean, make
 
 _TYRO = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
-ENV_HELP = "The environment; `hindrl envs` lists them. Any goal-conditioned one of Gymnasium is gymnasium:ID, as in gymnasium:FetchReach-v4."
+ENV_HELP = "The environment; `hindrl envs` lists them. One of Gymnasium is gymnasium:ID, as in gymnasium:FetchReach-v4."
 Brief = tuple[Mapping[str, Mapping[str, str]], Sequence[str]]  # as `short_page` takes them
 console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
 

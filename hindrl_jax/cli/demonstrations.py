@@ -99,28 +99,36 @@ def beside(source: str, suffix: str) -> Path:
     return Path(source.removeprefix(MINARI_PREFIX).rpartition("/")[2] if source.startswith(MINARI_PREFIX) else source).with_suffix(suffix)
 
 
+_SOURCE_ENV = "The environment, where the file does not say so: one of ours, gymnasium:ID, or MODULE:NAME for a task of your own."
+_AS_ENV = "The environment, likewise, whatever the file says: demonstrations of another program's task are declared to be of this one."
+
+
 def parse_with_meaning(
     options_class: type[Any], arguments: list[str], program: str, description: str | None
-) -> tuple[Any, Interpretation, Environment | None]:
-    """The options of a command that reads files of any tool: its own, what the modalities mean, and the environment, if one is named."""
-    name = peek(arguments, "env")
+) -> tuple[Any, Interpretation, dict[str, Any]]:
+    """The options of a command that reads files of any tool: its own, what the modalities mean, and what `convert.read` is told of the environment.
+
+    Raises:
+      UserError: for what cannot be understood, and for two environments.
+    """
+    given = {flag: name for flag in ("env", "as-env") if (name := peek(arguments, flag)) is not None}
+    if len(given) > 1:
+        raise UserError(f"--env {given['env']} and --as-env {given['as-env']} exclude each other: drop one of them")
+    name = next(iter(given.values()), None)
     fields: list[tuple[str, Any, Any]] = [
         ("options", options_class, dataclasses.MISSING),
         ("meaning", Interpretation, Interpretation()),
-        (
-            "env",
-            Annotated[Literal[tuple(TASKS)] | None, tyro.conf.arg(help="The environment, if it is one of ours and the file does not say so.")],
-            None,
-        ),
     ]
     if name is not None:
         environment = environment_of(arguments, name)
         fields.append(("environment", type(environment), environment))
+    names = env_names(name) if name is not None else Literal[tuple(TASKS)]
+    fields += [(flag, Annotated[names | None, tyro.conf.arg(help=text)], None) for flag, text in (("env", _SOURCE_ENV), ("as_env", _AS_ENV))]
     namespace = dataclasses.make_dataclass(
         "Options", [(field, kind) if default is dataclasses.MISSING else (field, kind, default) for field, kind, default in fields], frozen=True
     )
     parsed = parse(namespace, arguments, program, description)
-    return parsed.options, parsed.meaning, getattr(parsed, "environment", None)
+    return parsed.options, parsed.meaning, {"env": getattr(parsed, "environment", None), "as_env": "as-env" in given}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,9 +147,9 @@ class Convert:
 
 def convert(arguments: list[str]) -> None:
     """Convert demonstrations from and to robomimic, Minari and npz."""
-    options, meaning, env = parse_with_meaning(Convert, arguments, "hindrl demos convert", convert.__doc__)
+    options, meaning, environment = parse_with_meaning(Convert, arguments, "hindrl demos convert", convert.__doc__)
     check_target(options.target, overwrite=options.overwrite)
-    recording = read(options.source, meaning, env)
+    recording = read(options.source, meaning, **environment)
     if options.restore:
         restore(options.target, recording, source=options.source, overwrite=options.overwrite)
     else:
@@ -176,8 +184,8 @@ class RenderDemo:
 
 def render(arguments: list[str]) -> None:
     """Film demonstrations."""
-    options, meaning, env = parse_with_meaning(RenderDemo, arguments, "hindrl demos render", render.__doc__)
-    recording = read(options.source, meaning, env)
+    options, meaning, environment = parse_with_meaning(RenderDemo, arguments, "hindrl demos render", render.__doc__)
+    recording = read(options.source, meaning, **environment)
     states = [demo.states for demo in recording.demonstrations]
     if any(one is None for one in states):
         raise UserError(f"{options.source}: holds no states of one of our environments, which a film takes; render what hindrl demos record wrote")

@@ -42,15 +42,15 @@ class Info:
 
 def info(arguments: list[str]) -> None:
     """Say what a file of demonstrations holds."""
-    options, meaning, env = parse_with_meaning(Info, arguments, "hindrl demos info", info.__doc__)
+    options, meaning, environment = parse_with_meaning(Info, arguments, "hindrl demos info", info.__doc__)
     _check_epsilon(options)
     found = open_source(options.source)
     if isinstance(found, ForeignRecording):
         _print_foreign(found)
     try:
-        recording = understand(found, options.source, meaning, env)
+        recording = understand(found, options.source, meaning, **environment)
     except UserError as error:
-        if not isinstance(found, ForeignRecording) or meaning != Interpretation() or env is not None:
+        if not isinstance(found, ForeignRecording) or meaning != Interpretation() or environment["env"] is not None:
             raise
         console.print(f"not to be learned from as it is: {error}")
         return
@@ -149,12 +149,12 @@ class PlotDemo:
 
 def plot(arguments: list[str]) -> None:
     """Draw what the epsilon filter keeps of a demonstration."""
-    options, meaning, env = parse_with_meaning(PlotDemo, arguments, "hindrl demos plot", plot.__doc__)
+    options, meaning, environment = parse_with_meaning(PlotDemo, arguments, "hindrl demos plot", plot.__doc__)
     path = options.to or beside(options.source, ".png")
     if path.suffix != ".png":
         raise UserError(f"cannot draw {path.name}: the name must end in .png")
     _check_epsilon(options)
-    recording = read(options.source, meaning, env)
+    recording = read(options.source, meaning, **environment)
     check_demo(options.demo, len(recording.demonstrations), options.source)
     goals = recording.demonstrations[options.demo].achieved_goals
     if goals.shape[1] < 2:

@@ -17,6 +17,7 @@ import jax
 import numpy as np
 
 from hindrl_jax import STARTED
+from hindrl_jax.base.environments import can_step
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.steppers import SimulationFailed
 from hindrl_jax.base.types import Episodes
@@ -32,6 +33,8 @@ from hindrl_jax.runs.reporter import Reporter
 from hindrl_jax.runs.spec import CHECKPOINTS, FROM_PYTHON, RunSpec
 from hindrl_jax.runs.sweep import SweepWriter
 from hindrl_jax.runs.writer import RunWriter
+from hindrl_jax.tasks.checking import check_environment
+from hindrl_jax.tasks.registry import full_name
 from hindrl_jax.training.checks import check_demonstrations, check_memory
 from hindrl_jax.training.experiment import Diverged, fit
 from hindrl_jax.training.recording import record_demonstrations
@@ -86,6 +89,8 @@ def run(spec: RunSpec, configs: Sequence[TrainConfig], writer: RunWriter | Sweep
     num_demos = int(spec.demos) if is_number(spec.demos) else 1
     check_demonstrations(num_demos)
     check_memory(spec.env, configs[0], len(spec.seeds) * len(configs), num_demos)
+    if not resumes and ":" in full_name(spec.env) and can_step(spec.env):  # a task of the user's own
+        check_environment(spec.env)
     with ProgressBar(console=console) as waiting:
         if resumes and checkpoints.has_demonstrations:
             demonstrations = checkpoints.load_demonstrations()

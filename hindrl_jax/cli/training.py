@@ -13,6 +13,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from hindrl_jax.base.environments import Restorable, can_step
 from hindrl_jax.cli.common import console, peek
 from hindrl_jax.cli.hosts import joined_hosts
 from hindrl_jax.cli.running import check_unfinished, checkpoints_of, default_out, reporters_of, run, speed_line
@@ -120,7 +121,8 @@ def _nothing_solved(spec: RunSpec) -> list[str]:
     lines.append(f"a longer run: --steps {2 * spec.config.num_steps}; and other seeds: --seeds 4")
     if few:
         lines.append(f"more demonstrations: --demos {10 * int(spec.demos)}")
-    if spec.config.algo != "bc" and not spec.config.demo_reset_ratio:
+    can_reset = can_step(spec.env) and isinstance(spec.env, Restorable)
+    if spec.config.algo != "bc" and not spec.config.demo_reset_ratio and can_reset:
         lines.append("begin half of the training episodes in demonstrated states: --demo-reset-ratio 0.5")
     return [lines[0], *(f"  {number}. {line}" for number, line in enumerate(lines[1:], 1))]
 

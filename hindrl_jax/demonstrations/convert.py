@@ -18,7 +18,7 @@ from hindrl_jax.demonstrations import minari, npz, robomimic
 from hindrl_jax.demonstrations.episodes import as_episodes
 from hindrl_jax.demonstrations.foreign import ForeignRecording, Interpretation
 from hindrl_jax.demonstrations.hdf5 import check_recording, load_demonstrations, read_recording, write_recording
-from hindrl_jax.demonstrations.interpret import interpret
+from hindrl_jax.demonstrations.interpret import interpret, redeclared
 from hindrl_jax.demonstrations.recording import Recording
 from hindrl_jax.tasks.registry import TASKS, make
 
@@ -44,37 +44,54 @@ def open_source(source: str) -> ForeignRecording | Recording:
     return read_recording(path) if robomimic.is_ours(path) else robomimic.read(path)
 
 
-def read(source: str, meaning: Interpretation | None = None, env: Environment | None = None) -> Recording:
+def read(source: str, meaning: Interpretation | None = None, env: Environment | None = None, *, as_env: bool = False) -> Recording:
     """Reads demonstrations of any format.
 
     Args:
       source: a file, or minari:NAME-v0.
       meaning: what the modalities of a file of another tool are; of no use for files that hindrl_jax has written.
-      env: the environment of the task, if it is one of ours and the file does not say so.
+      env: the environment of the task, if it is one that we know and the file does not say so.
+      as_env: whether the demonstrations are declared to be of `env`, whatever the file says.
 
     Raises:
       UserError: it cannot be read, or does not hold what is needed; the message says what to do.
     """
-    return understand(open_source(source), source, meaning, env)
+    return understand(open_source(source), source, meaning, env, as_env=as_env)
 
 
-def understand(found: ForeignRecording | Recording, source: str, meaning: Interpretation | None = None, env: Environment | None = None) -> Recording:
+def understand(
+    found: ForeignRecording | Recording,
+    source: str,
+    meaning: Interpretation | None = None,
+    env: Environment | None = None,
+    *,
+    as_env: bool = False,
+) -> Recording:
     """The second half of `read`, for what `open_source` has found."""
+    declared = env is not None and (as_env or env.name == found.env_name.rpartition(":")[2])  # or it names the same task without its module
     if isinstance(found, Recording):
         if meaning not in (None, Interpretation()):
             raise UserError(
                 f"{source}: was written by hindrl_jax, which has said what is what; leave out the options about keys, actions and success"
             )
+        if env is None:
+            return found
+        if not declared:
+            raise UserError(f"{source}: {_says_itself(found)}")
+        recording = redeclared(found, env, source)
+        check_recording(recording, source)
+        return recording
+    if found.env_name in TASKS and not declared:
         if env is not None:
-            raise UserError(f"{source}: says itself that it is of {found.env_name}; leave out --env")
-        return found
-    if found.env_name in TASKS:
-        if env is not None:
-            raise UserError(f"{source}: says itself that it is of {found.env_name}; leave out --env")
+            raise UserError(f"{source}: {_says_itself(found)}")
         env = make(found.env_name, **found.env_kwargs)
     recording = interpret(found, meaning or Interpretation(), env)
     check_recording(recording, source)
     return recording
+
+
+def _says_itself(found: ForeignRecording | Recording) -> str:
+    return f"says itself that it is of {found.env_name}; leave out --env, or declare it to be of another task with --as-env"
 
 
 def load(source: str, env: Environment, *, num_demos: int | None = None) -> Episodes:
@@ -89,7 +106,7 @@ def load(source: str, env: Environment, *, num_demos: int | None = None) -> Epis
         return load_demonstrations(source, env, num_demos=num_demos)
     found = open_source(source)
     if isinstance(found, ForeignRecording):
-        if found.env_name.startswith(minari.GYMNASIUM) and found.env_name != env.name:
+        if found.env_name.startswith(minari.GYMNASIUM) and found.env_name.rpartition(":")[2] != env.name.rpartition(":")[2]:  # modules apart
             raise UserError(f"{source}: was recorded in {found.env_name}, not in {env.name}; train in the former")
         try:
             found = understand(found, source, env=None if found.env_name in TASKS else env)

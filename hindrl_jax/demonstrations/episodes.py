@@ -26,8 +26,26 @@ def as_episodes(recording: Recording, env: Environment, *, where: str | os.PathL
     check_number(where, num_demos)
     check_lengths(where, [len(demo) for demo in recording.demonstrations], env.horizon, num_demos)
     demos = [demo for demo in recording.demonstrations if len(demo) <= env.horizon][:num_demos]
-    check_against_env(where, dataclasses.replace(recording, demonstrations=tuple(demos)), env)
-    return as_table(demos, env.horizon)
+    recording = with_goals_chosen(dataclasses.replace(recording, demonstrations=tuple(demos)), env)
+    check_against_env(where, recording, env)
+    return as_table(recording.demonstrations, env.horizon)
+
+
+def with_goals_chosen(recording: Recording, env: Environment) -> Recording:
+    """The recording with the goals that `env` derives, where what a goal is is only chosen: flat observations of Gymnasium, `achieved_goal_indices`.
+
+    So a file serves other choices than the one with which it was recorded. The desired goals are then the ends of the demonstrations.
+    """
+    chosen = getattr(env, "achieved_goal_indices", None)
+    fits = all(demo.observations.shape[1] == env.observation_dim for demo in recording.demonstrations)
+    if chosen is None or list(chosen) == list(recording.env_kwargs.get("achieved_goal_indices", ())) or not fits:
+        return recording
+    goals = [np.asarray(env.achieved_goal(cast(Any, demo.observations))) for demo in recording.demonstrations]
+    demos = (
+        dataclasses.replace(demo, achieved_goals=reached, desired_goal=reached[-1])
+        for demo, reached in zip(recording.demonstrations, goals, strict=True)
+    )
+    return dataclasses.replace(recording, demonstrations=tuple(demos))
 
 
 def as_table(demos: Sequence[Demonstration], horizon: int) -> Episodes:

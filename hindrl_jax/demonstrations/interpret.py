@@ -18,6 +18,7 @@ from hindrl_jax.demonstrations._layout import layout
 from hindrl_jax.demonstrations._selection import Selection, joined_columns, select
 from hindrl_jax.demonstrations.foreign import MINARI_OBSERVATIONS, SOURCE, ForeignDemonstration, ForeignRecording, Interpretation
 from hindrl_jax.demonstrations.recording import Demonstration, Recording, plain
+from hindrl_jax.tasks.registry import full_name
 
 _ACTION_TOLERANCE = 1e-5
 _STATE_TOLERANCE = 1e-4
@@ -46,7 +47,7 @@ def interpret(foreign: ForeignRecording, meaning: Interpretation, env: Environme
     interpreted = [dataclasses.replace(demo, states=_states(demo, env, last_state)) for demo in interpreted]
     as_recorded = foreign.ours and all(demo.states is not None for demo in interpreted)
     return Recording(
-        env_name=foreign.env_name if env is None else env.name,
+        env_name=foreign.env_name if env is None else full_name(env),
         env_kwargs=foreign.env_kwargs if env is None else plain(dataclasses.asdict(env)),
         expert=foreign.expert,
         demonstrations=tuple(_settled(demo) for demo in interpreted),
@@ -54,6 +55,39 @@ def interpret(foreign: ForeignRecording, meaning: Interpretation, env: Environme
         extras=foreign.extras,
         attributes=foreign.attributes,
         file_attributes=foreign.file_attributes,
+    )
+
+
+def redeclared(recording: Recording, env: Environment, where: str) -> Recording:
+    """A recording of ours, as one of another environment: its goals are those that `env` derives, and its states are kept if they may be its own.
+
+    Args:
+      recording: as it was read.
+      env: what the demonstrations are declared to be of.
+      where: begins the messages.
+
+    Raises:
+      UserError: if its observations or actions have other dimensions than the environment's.
+    """
+    first = recording.demonstrations[0]
+    for what, there, here in (("observations", first.observations, env.observation_dim), ("actions", first.actions, env.action_dim)):
+        if there.shape[1] != here:
+            raise UserError(
+                f"{where}: {what} have {there.shape[1]} numbers, but {here} in {env.name}; declare it to be of another task with --as-env"
+            )
+    goals = [np.asarray(env.achieved_goal(jnp.asarray(demo.observations, jnp.float32))) for demo in recording.demonstrations]
+    has_states = first.states is not None and first.states.shape[1] == state_dim(env)
+    demos = (
+        dataclasses.replace(demo, achieved_goals=reached, desired_goal=reached[-1], states=demo.states if has_states else None)
+        for demo, reached in zip(recording.demonstrations, goals, strict=True)
+    )
+    before = {"format": "hindrl_jax", "env_name": recording.env_name, "attributes": sorted(recording.attributes)}
+    return dataclasses.replace(
+        recording,
+        env_name=full_name(env),
+        env_kwargs=plain(dataclasses.asdict(env)),
+        demonstrations=tuple(demos),
+        converted_from=recording.converted_from or before,
     )
 
 

@@ -5,9 +5,9 @@ environment's `state` (T + 1, S). Where Gymnasium knows the environment as hindr
 as the other modalities of a robomimic file, is left out.
 
 A dataset of somebody else is read so that it can be learned from in the same environment. If that is one of Gymnasium's, the observation is
-[observation, achieved_goal], as in `hindrl train --env gymnasium:ID`. The task counts as solved where the infos say success or is_success, if there
-are such infos, else where the episode terminated. Converted back it is as it was: seeds, options, infos, metadata and the environment's specification
-are kept in our file.
+[observation, achieved_goal], or what is observed where that is flat, as in `hindrl train --env gymnasium:ID`. The task counts as solved where the
+infos say success or is_success, if there are such infos, else where the episode terminated. Converted back it is as it was: seeds, options, infos,
+metadata and the environment's specification are kept in our file.
 
 Nothing is downloaded: `minari download NAME-v0` does that.
 """
@@ -33,8 +33,8 @@ from hindrl_jax.base.files import check_free
 from hindrl_jax.demonstrations._minari_episodes import as_demonstration, as_episode, as_source_episode, source_metadata
 from hindrl_jax.demonstrations.foreign import ForeignRecording
 from hindrl_jax.demonstrations.recording import Recording, plain
+from hindrl_jax.tasks.describing import action_bounds
 from hindrl_jax.tasks.registry import TASKS, make
-from hindrl_jax.tasks.simulators import action_bounds
 
 PREFIX = "minari:"
 GYMNASIUM = "gymnasium:"  # begins the names of environments that are not ours
@@ -91,12 +91,17 @@ def read(name: str) -> ForeignRecording:
             as_demonstration(source, n, episode, metadata, ours=ours is not None)
             for n, (episode, metadata) in enumerate(zip(episodes, episode_metadata, strict=True))
         ),
-        observation_keys=("observation", "achieved_goal") if ours is None and env_name.startswith(GYMNASIUM) else ("observation",),
+        observation_keys=("observation", "achieved_goal") if ours is None and _gives_goals(env_name, episodes[0]) else ("observation",),
         action_low=low,
         action_high=high,
         ours=ours is not None,
         about={} if ours is not None else {"metadata": json.dumps(raw)},
     )
+
+
+def _gives_goals(env_name: str, episode: Any) -> bool:
+    """Whether an episode is of an environment of Gymnasium whose observations come with goals, rather than flat."""
+    return env_name.startswith(GYMNASIUM) and isinstance(episode.observations, dict) and "achieved_goal" in episode.observations
 
 
 def _environment(spec: Any, ours: dict[str, Any] | None) -> tuple[str, dict[str, Any]]:

@@ -1,16 +1,26 @@
-"""Goal-conditioned environments of Gymnasium, as tasks to learn: `hindrl_jax.make("gymnasium:FetchReach-v4")`.
+"""Environments of Gymnasium, as tasks to learn: `hindrl_jax.make("gymnasium:FetchReach-v4")`.
 
-They are stepped on the host, by their own code, many side by side (`hindrl_jax.tasks.simulators`).
+They are stepped on the host, by their own code, many side by side (`hindrl_jax.tasks.simulators`). Their actions are vectors with bounds.
+States cannot be written down: episodes begin where the environment lets them begin. There are two kinds:
 
-  * Any environment will do whose observations are dictionaries of vectors `observation`, `achieved_goal` and `desired_goal`, and whose actions are
-    vectors with bounds. Here the observation is [observation, achieved_goal], and the goal of an episode is the desired goal of its first
-    observation. Networks see the goal beside the observation, so that it can be another in hindsight.
+**With goals.** Observations are dictionaries of vectors `observation`, `achieved_goal` and `desired_goal`.
+
+  * Here the observation is [observation, achieved_goal], and the goal of an episode is the desired goal of its first observation. Networks see the
+    goal beside the observation, so that it can be another in hindsight.
   * The reward is 1 where the environment says that the goal is reached (info["is_success"] or info["success"], else a reward as high as that of
     reaching the goal exactly), else 0, whatever the environment's own is. The episode ends there, as in all our tasks, also where the environment
     itself would go on. So success means that the goal was reached at some step, not that it was held until the last one.
   * `goal_tolerance` is the half-width of the largest box within the environment's ball, where it has one (`distance_threshold`). Goals in hindsight
     count as reached within a box, so they are never easier than the environment's own.
-  * States cannot be written down: episodes begin where the environment lets them begin.
+
+**Flat.** Observations are vectors, and a sparse reward or a success flag says when the task is solved.
+
+  * The achieved goal is the observation, or the part of it that `achieved_goal_indices` names. Episodes come without goals: rollouts aim at the ends
+    of demonstrations, and goals in hindsight count as reached within epsilon, which follows from the demonstrations (thesis eq. 4.7 and 4.8).
+  * The reward is 1 where the task is solved, else 0, and the episode ends there. It is solved where the info says so, info["is_success"] or
+    info["success"]; where the first step's info has neither, at a step with a reward of at least `success_reward`; and where that is not given, at a
+    step that ends the episode (terminated) with a reward above 0, unless that step's info says otherwise. An episode that the environment ends
+    otherwise has failed, and its last state is worth nothing.
 """
 
 from __future__ import annotations
@@ -25,8 +35,10 @@ import numpy as np
 from hindrl_jax.base.checks import check, check_types
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Array
+from hindrl_jax.tasks.describing import Description, arguments_of, describe, played_actions
 from hindrl_jax.tasks.ids import check_registered
-from hindrl_jax.tasks.simulators import Description, Simulators, arguments_of, describe, played_actions
+from hindrl_jax.tasks.simulators import Simulators
+from hindrl_jax.tasks.success import SuccessRule
 
 PREFIX = "gymnasium:"
 
@@ -40,9 +52,8 @@ class GymnasiumEnv:
 
     name: ClassVar[str]
     id: ClassVar[str]
-    interchangeable: ClassVar[tuple[str, ...]] = ("vectorization",)
+    interchangeable: ClassVar[tuple[str, ...]] = ("vectorization", "achieved_goal_indices", "success_reward")
     """Arguments in which demonstrations may differ from the environment that learns from them."""
-    gives_goals: ClassVar[bool] = True
 
     horizon: int | None = None
     """Number of steps after which an episode is truncated; by default what Gymnasium's registry says."""
@@ -50,15 +61,37 @@ class GymnasiumEnv:
     """Arguments for gymnasium.make, as NAME=VALUE, the value in JSON or a plain word."""
     vectorization: Literal["sync", "async"] = "sync"
     """Environments one after the other in one process, or each in a process of its own, which pays where a step takes milliseconds."""
+    achieved_goal_indices: tuple[int, ...] = ()
+    """Of flat observations: the numbers, from 0, that make up the achieved goal (default: all of the observation)."""
+    success_reward: float | None = None
+    """Of flat observations, where no info says when the task is solved: the least reward that does (default: any above 0 that ends an episode)."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "make_kwargs", tuple(self.make_kwargs))
+        for name in ("make_kwargs", "achieved_goal_indices"):  # files have lists in their place
+            if isinstance(getattr(self, name), list):
+                object.__setattr__(self, name, tuple(getattr(self, name)))
         check_types(self)
         check(self, horizon=(self.horizon is None or self.horizon >= 1, "at least 1"))
         if self.horizon is None:
             if self.description.horizon is None:
                 raise UserError(f"{self.name} sets no limit to the length of an episode: give a horizon")
             object.__setattr__(self, "horizon", self.description.horizon)
+        if self.achieved_goal_indices or self.success_reward is not None:
+            self._check_flat()
+
+    def _check_flat(self) -> None:
+        """Makes sure that the options of flat observations can be had."""
+        indices, what = self.achieved_goal_indices, self.description
+        if what.gives_goals:
+            option = "achieved_goal_indices" if indices else "success_reward"
+            raise UserError(f"{option} is for flat observations, and {self.name} says itself what its goals are: leave it out")
+        if not all(0 <= index < what.observation_dim for index in indices) or len({*indices}) < len(indices):
+            raise UserError(
+                f"achieved_goal_indices = {list(indices)} is not usable: {self.name} observes {what.observation_dim} numbers, give different ones "
+                f"from 0 to {what.observation_dim - 1}"
+            )
+        if self.success_reward is not None and what.success.key is not None:
+            raise UserError(f"success_reward is of no use in {self.name}, whose info says {what.success.key!r} at each step: leave it out")
 
     @property
     def arguments(self) -> dict[str, Any]:
@@ -71,12 +104,22 @@ class GymnasiumEnv:
         return describe(self.id, self.make_kwargs)
 
     @property
+    def gives_goals(self) -> bool:
+        """Whether each episode comes with a goal of its own; not where observations are flat."""
+        return self.description.gives_goals
+
+    @property
+    def success_rule(self) -> SuccessRule:
+        """What says that the task is solved."""
+        return self.description.success if self.success_reward is None else SuccessRule(reward=self.success_reward)
+
+    @property
     def observation_dim(self) -> int:
         return self.description.observation_dim + self.description.goal_dim
 
     @property
     def goal_dim(self) -> int:
-        return self.description.goal_dim
+        return self.description.goal_dim if self.gives_goals else len(self.achieved_goal_indices) or self.observation_dim
 
     @property
     def action_dim(self) -> int:
@@ -107,8 +150,10 @@ class GymnasiumEnv:
         return None if tolerance is None else np.full(self.goal_dim, tolerance, np.float32)
 
     def achieved_goal(self, observation: Array) -> Array:
-        """The end of the observation: (..., D) -> (..., G)."""
-        return observation[..., self.description.observation_dim :]
+        """The end of the observation, or of a flat one all of it, or what `achieved_goal_indices` names: (..., D) -> (..., G)."""
+        if self.gives_goals:
+            return observation[..., self.description.observation_dim :]
+        return observation[..., np.array(self.achieved_goal_indices)] if self.achieved_goal_indices else observation
 
     def task_goal(self) -> Array:
         raise UserError(f"{self.name} has no one goal for all episodes: choose other behavioural goals")

@@ -12,6 +12,7 @@ import importlib
 import io
 import os
 import sys
+from collections.abc import Iterator
 from typing import Any
 
 import gymnasium
@@ -57,6 +58,21 @@ def check_not_forked() -> None:
         )
 
 
+@contextlib.contextmanager
+def working_directory_on_path() -> Iterator[None]:
+    """Lets modules be imported from the working directory, last of all, which an installed command does not look into by itself."""
+    folder = os.getcwd()
+    if folder in sys.path:
+        yield
+        return
+    sys.path.append(folder)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(ValueError):  # what was imported may have changed the path, too
+            sys.path.remove(folder)
+
+
 def gymnasium_id(name: str) -> str:
     """The id of one of our environments, for `gymnasium.make`."""
     return f"{NAMESPACE}/{name}-v0"
@@ -84,12 +100,14 @@ def check_registered(gymnasium_id: str) -> None:
     module, _, env_id = gymnasium_id.rpartition(":")
     if module or env_id not in gymnasium.registry:
         try:
-            with contextlib.redirect_stderr(io.StringIO()):  # gymnasium-robotics prints news of some of its environments, whichever one wants
+            # gymnasium-robotics prints news of some of its environments, whichever one wants.
+            with working_directory_on_path(), contextlib.redirect_stderr(io.StringIO()):
                 importlib.import_module(module or ROBOTICS)
         except Exception as error:  # packages that load a simulator fail in many ways
             if module or not (isinstance(error, ModuleNotFoundError) and error.name == ROBOTICS):
                 name = module or ROBOTICS
-                raise UserError(f"{gymnasium_id}: {name} cannot be imported ({one_line(error)}): install it, or mend what it complains of") from error
+                advice = "install it, or start in the folder where it is, or mend what it complains of"
+                raise UserError(f"{gymnasium_id}: {name} cannot be imported ({one_line(error)}): {advice}") from error
     if env_id not in gymnasium.registry:
         close = difflib.get_close_matches(env_id, list(gymnasium.registry), n=1)
         hint = f" (did you mean {close[0]!r}?)" if close else ""
@@ -108,7 +126,8 @@ def make_single(gymnasium_id: str, arguments: dict[str, Any], max_episode_steps:
     check_registered(gymnasium_id)
     limit = {} if max_episode_steps is None else {"max_episode_steps": max_episode_steps}
     try:
-        return gymnasium.make(gymnasium_id.rpartition(":")[2], render_mode=render_mode, disable_env_checker=True, **limit, **arguments)
+        with working_directory_on_path():
+            return gymnasium.make(gymnasium_id.rpartition(":")[2], render_mode=render_mode, disable_env_checker=True, **limit, **arguments)
     except UserError:
         raise
     except Exception as error:  # of any kind: what it takes to be made is the environment's own business

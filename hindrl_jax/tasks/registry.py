@@ -9,8 +9,6 @@ import dataclasses
 import difflib
 import importlib
 import inspect
-import os
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -26,6 +24,7 @@ from hindrl_jax.experts.grid import GridExpert
 from hindrl_jax.experts.reach import ReachExpert
 from hindrl_jax.experts.robosuite_arm import play_in_robosuite
 from hindrl_jax.tasks import from_gymnasium
+from hindrl_jax.tasks.ids import working_directory_on_path
 
 Act = Callable[[Array, Any, Array], Array]
 """(key, state, observation (D,)) -> action (A,) in the environment's own units."""
@@ -142,15 +141,13 @@ def full_name(env: Environment) -> str:
 
 def _import_from_here(module: str) -> None:
     """Imports a module from PYTHONPATH or, last of all, the working directory, which an installed command does not look into by itself."""
-    sys.path.append(os.getcwd())
     try:
-        importlib.import_module(module)
+        with working_directory_on_path():
+            importlib.import_module(module)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
             raise  # the module is there, and something that it imports is not
         raise UserError(f"there is no module {module!r}: start the command in the folder where it is, or put that on PYTHONPATH") from error
-    finally:
-        sys.path.pop()
 
 
 def make(name: str, **arguments: Any) -> Environment:

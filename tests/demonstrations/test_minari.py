@@ -12,12 +12,13 @@ import jax
 import minari
 import numpy as np
 import pytest
+from flat_env import to_corner
 from foreign_files import TINY, refusal
 
 from hindrl_jax import cli
 from hindrl_jax.base.environments import action_to_env
 from hindrl_jax.base.errors import UserError
-from hindrl_jax.demonstrations.convert import read, write
+from hindrl_jax.demonstrations.convert import load, read, write
 from hindrl_jax.demonstrations.foreign import Interpretation
 from hindrl_jax.demonstrations.hdf5 import read_recording
 from hindrl_jax.tasks.registry import make
@@ -122,6 +123,39 @@ def test_minari_dataset_loads_trains_and_comes_back(collected, recorded, env, tm
     assert "left out" not in capsys.readouterr().out
     assert_same_dataset(collected, minari.load_dataset("grid/back-v0"))
     assert sorted(minari.list_local_datasets()) == ["grid/back-v0", "grid/collected-v0"]
+
+
+def collect_two_flat_episodes(name):
+    """One into the corner, and one that ends elsewhere: how long the first is, and the observations where it begins and ends."""
+    collector = minari.DataCollector(gymnasium.make("PointFlat-v0", says="last", disable_env_checker=True))
+    observation, _ = collector.reset(seed=3)
+    begun, length, ended = observation, 0, False
+    while not ended:
+        observation, _, ended, _, _ = collector.step(to_corner(observation, np.random.default_rng(0)).astype(np.float32))
+        length += 1
+    collector.reset(seed=4)
+    collector.step(np.zeros(2, np.float32))
+    about = dict(algorithm_name="expert", author="A", author_email="a@b.c", code_permalink="here", description="test", eval_env="PointFlat-v0")
+    collector.create_dataset(name, **about)
+    collector.close()
+    return length, begun, observation
+
+
+def test_flat_observations_are_learned_from_where_they_were_recorded():
+    """The dataset knows the environment without the module that registers it."""
+    env = make("gymnasium:flat_env:PointFlat-v0", says="last", achieved_goal_indices=(0, 1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)  # Minari leaves a temporary folder to the garbage collector
+        length, begun, observation = collect_two_flat_episodes("flat/point-v0")
+        gc.collect()
+    table = load("minari:flat/point-v0", env)
+    assert table.lengths.tolist() == [length, 1]
+    assert table.terminated.tolist() == [True, False]
+    np.testing.assert_array_equal(table.observations[0, [0, length]], [begun, observation])
+    np.testing.assert_array_equal(table.desired_goals[0], observation[:2])
+    assert "was recorded in gymnasium:PointFlat-v0, not in gymnasium:Pendulum-v1" in refusal(
+        lambda: load("minari:flat/point-v0", make("gymnasium:Pendulum-v1"))
+    )
 
 
 def test_dataset_of_an_environment_that_is_not_ours(tmp_path):

@@ -10,7 +10,7 @@ from point_env import SPEED
 import hindrl_jax as hindrl
 from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.errors import UserError
-from hindrl_jax.tasks import simulators as simulation
+from hindrl_jax.tasks import describing
 from hindrl_jax.tasks.simulators import Simulators
 
 POINT = "gymnasium:point_env:PointGoal-v0"
@@ -48,7 +48,7 @@ def test_arguments_go_to_gymnasium_and_survive_the_way_through_a_file():
     assert hindrl.make(env.name, **dataclasses.asdict(env)) == env
     assert hindrl.make(POINT, make_kwargs=["says=reward"]).arguments == {"says": "reward"}  # a list, as JSON has it
     for word, value in (("False", False), ("false", False), ("None", None), ("null", None), ("3", 3), ("Falsely", "Falsely")):
-        assert simulation.arguments_of((f"says={word}",)) == {"says": value}
+        assert describing.arguments_of((f"says={word}",)) == {"says": value}
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def test_arguments_go_to_gymnasium_and_survive_the_way_through_a_file():
     [
         ("gymnasium:PointGoal-v7", {}, "knows no environment 'PointGoal-v7' .did you mean 'PointGoal-v0'"),
         ("gymnasium:no_such_module:X-v0", {}, "no_such_module cannot be imported"),
-        ("gymnasium:CartPole-v1", {}, "not goal-conditioned"),
+        ("gymnasium:CartPole-v1", {}, "its actions are Discrete.2., which are discrete.* choose the continuous form"),
         ("gymnasium:PointGoalForever-v0", {}, "give a horizon"),
         (POINT, {"speed": 3}, "failed: .*unexpected keyword argument 'speed'"),
         (POINT, {"make_kwargs": ("says",)}, "NAME=VALUE"),
