@@ -20,7 +20,8 @@ def show(arguments: list[str]) -> None:
     for name, path in shipped().items():
         spec, summary = read_spec(path), json.loads((path / SUMMARY).read_text())
         (seed,) = summary["seeds"]
-        cells = (f"{seed['returned_env_steps']:,} steps", f"{seed['returned_success']:.0%}", f"{seed['returned_length']:.0f}")
+        taken = f"{seed['returned_env_steps']:,} steps" if spec.config.learns_from_rollouts else f"{seed['returned_updates']:,} updates"
+        cells = (taken, f"{seed['returned_success']:.0%}", f"{seed['returned_length']:.0f}")
         table.add_row(name, spec.config.algo, spec.demos, *cells)
     console.print(table)
     console.print(f"`hindrl render {PREFIX}NAME` films one, `hindrl eval {PREFIX}NAME` plays fresh episodes with it;")

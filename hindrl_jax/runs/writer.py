@@ -194,8 +194,9 @@ def _save_parameters(path: Path, result: Result) -> None:
         "policy_noise": np.asarray(result.returned.noise, np.float32),
         "last_policy": policy(agent, average=True).actor,
         "actor": agent.actor,
-        "critics": agent.critics,
-        "log_alpha": agent.log_alpha,
+        **(
+            {"critics": agent.critics, "log_alpha": agent.log_alpha} if result.configs[0].learns_from_rollouts else {}
+        ),  # bc leaves them as they began
         "epsilon": result.guidance.epsilon,
         "behavioural_goals": {"goals": goals.goals, "count": goals.count},
         "input_scale": {field.name: getattr(scale, field.name) for field in dataclasses.fields(scale)},

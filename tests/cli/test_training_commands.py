@@ -291,7 +291,7 @@ def test_policies_that_ship_are_listed_and_small(tmp_path, capsys, monkeypatch):
     assert {"FixedGridPickAndPlace", "FixedParameterizedReach"} <= set(shipped())
     for name, path in shipped().items():
         assert f" {name} " in printed
-        assert sum(file.stat().st_size for file in path.iterdir()) < 1_000_000
+        assert sum(file.stat().st_size for file in path.iterdir()) < 1_500_000
         assert load_run(path).spec.env.name == name
     cli.main(["eval", "policy:FixedGridPickAndPlace", "--episodes", "20"])
     assert " 2      100.0%" in capsys.readouterr().out
@@ -304,4 +304,4 @@ def test_policies_that_ship_are_listed_and_small(tmp_path, capsys, monkeypatch):
 @pytest.mark.parametrize("name", shipped())
 def test_policies_that_ship_solve_their_tasks(name):
     (outcome,) = load_run(shipped()[name]).evaluate(episodes=100)
-    assert outcome["success"] >= (0.75 if name == "BringNear" else 0.98)
+    assert outcome["success"] >= 0.97

@@ -77,9 +77,8 @@ def test_settings_that_come_to_the_same_run_share_its_directory():
 @pytest.mark.parametrize("scale", SCALES)
 def test_every_cell_has_a_directory_of_its_own_run(recipe, scale):
     cells = cells_of(Path("out"), settings_of(ALL), recipe=recipe, scale=scale)
-    assert (
-        len({cell.path for cell in cells.values()}) == len({(cell.path, cell.spec) for cell in cells.values()}) == (40 if recipe == "default" else 38)
-    )
+    # one of the weights of section 5.3 is that of the recipe, so those two settings, of both algorithms, are other cells, too
+    assert len({cell.path for cell in cells.values()}) == len({(cell.path, cell.spec) for cell in cells.values()}) == 38
 
 
 def test_full_is_the_appendix_unchanged():

@@ -67,7 +67,7 @@ def test_a_table_shows_the_thesis_beside_what_was_run(out):
     one, *entries = rows[3]
     assert (one, entries[0], entries[2], entries[4]) == ("1", "0%", "100%", "100%")
     # Middle halves: of 0, .1, .3, .4 and of 0, .9, 1, 1. TQCfD's seeds reach 95% after inf, 2,000, 2,000 and 1,000 steps.
-    assert re.fullmatch(r"20 \[0, 40\]; best 40; 0/4; >4k", entries[1])
+    assert re.fullmatch(r"20 \[0, 40\]; best 40; 0/4; >2k", entries[1])
     assert re.fullmatch(r"95 \[\d+, 100\]; best 100; 3/4; 2k", entries[3])
     assert entries[5] == "100 [100, 100]; best 100; 8/8; 1k"
     _, _, *rows = rows_of(text, "Table 5.3", "the original code")
