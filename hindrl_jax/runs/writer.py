@@ -189,6 +189,7 @@ def peak_memory_bytes() -> int:
 
 def _save_parameters(path: Path, result: Result) -> None:
     agent, goals, scale = result.state.agent, result.guidance.behavioural_goals, result.state.agent.scale
+    trained = {"critics": agent.critics, "log_alpha": agent.log_alpha} if result.configs[0].learns_from_rollouts else {}
     tree = {
         "policy": result.returned.actor,
         "policy_noise": np.asarray(result.returned.noise, np.float32),
