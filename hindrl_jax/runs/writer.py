@@ -189,15 +189,14 @@ def peak_memory_bytes() -> int:
 
 def _save_parameters(path: Path, result: Result) -> None:
     agent, goals, scale = result.state.agent, result.guidance.behavioural_goals, result.state.agent.scale
+    # cloning leaves its critics as they began
     trained = {"critics": agent.critics, "log_alpha": agent.log_alpha} if result.configs[0].learns_from_rollouts else {}
     tree = {
         "policy": result.returned.actor,
         "policy_noise": np.asarray(result.returned.noise, np.float32),
         "last_policy": policy(agent, average=True).actor,
         "actor": agent.actor,
-        **(
-            {"critics": agent.critics, "log_alpha": agent.log_alpha} if result.configs[0].learns_from_rollouts else {}
-        ),  # bc leaves them as they began
+        **trained,
         "epsilon": result.guidance.epsilon,
         "behavioural_goals": {"goals": goals.goals, "count": goals.count},
         "input_scale": {field.name: getattr(scale, field.name) for field in dataclasses.fields(scale)},
