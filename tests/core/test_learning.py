@@ -45,3 +45,19 @@ def test_cloning_needs_many_demonstrations():
     env = hindrl.make("FixedGridPickAndPlace")
     few, many = (hindrl.fit(env, hindrl.record_demonstrations(env, count), hindrl.preset("bc")).final_success[0] for count in (1, 250))
     assert few < 0.3 < many
+
+
+@pytest.mark.parametrize("name", ["BringNear", "CableInsertion"])
+def test_cloning_solves_the_cable_tasks(name):
+    env = hindrl.make(name)
+    seeds = [7001, 7002]
+    demonstrations = [hindrl.record_demonstrations(env, 20, seed=seed) for seed in seeds]
+    result = hindrl.fit(env, demonstrations, hindrl.preset("bc", env=env), seeds=seeds)
+    success = [summary.returned_success for summary in result.summaries()]
+    assert min(success) >= 0.8, success
+
+
+@pytest.mark.parametrize("name", ["BringNear", "CableInsertion"])
+def test_what_was_learnt_in_closed_form_holds_in_mujoco(name):
+    (outcome,) = hindrl.load_run(f"policy:{name}").in_backend("mujoco").evaluate(episodes=25)
+    assert outcome["success"] >= 0.9
