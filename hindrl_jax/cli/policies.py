@@ -16,7 +16,7 @@ from hindrl_jax.runs.spec import SUMMARY, read_spec
 def show(arguments: list[str]) -> None:
     """List the trained policies that come with the package."""
     parse(dataclasses.make_dataclass("Policies", []), arguments, "hindrl policies", show.__doc__)
-    table = Table("policy", "algo", "demos", "trained for", "success", "length", box=box.SIMPLE_HEAD)
+    table = Table("policy", "algo", "demos", "best after", "success", "length", box=box.SIMPLE_HEAD)
     for name, path in shipped().items():
         spec, summary = read_spec(path), json.loads((path / SUMMARY).read_text())
         (seed,) = summary["seeds"]

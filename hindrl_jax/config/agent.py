@@ -43,8 +43,8 @@ class AgentConfig:
     """Share of the gradient steps so far that the actor's running average spans, which evaluations and the saved policy use: it moves by
     1 / (1 + span * steps), less and less. With 0 it is the actor itself."""
     relative_value: bool = True
-    """Divide the value in the actor's loss, row by row, by itself, or by 0.01 where it is less: as if the actor climbed the value's logarithm. One
-    step lost then weighs alike near the reward and far from it. The entropy is then in other units than rewards, and the targets leave it out."""
+    """Divide each row's value in the actor's loss by max(itself, 0.01), a constant: as if the actor climbed the value's logarithm. One step lost then
+    weighs alike near the reward and far from it. For values in [0, 1]. Entropy is then in other units, and not added to the critics' targets."""
     initial_alpha: float = 0.02
     """Entropy coefficient at the start; it is tuned automatically from there."""
     target_entropy: float = -1.0

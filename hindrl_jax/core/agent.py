@@ -115,9 +115,10 @@ def update(key: Array, state: AgentState, batch: Transition, schedule: Schedule,
     """One gradient step of critics, actor and entropy coefficient, then one move of the target networks and of the averaged actor.
 
     Critic: quantile Huber loss towards the truncated atoms of r + discount (Z' - alpha log pi(a' | s')); for algorithms without quantiles the
-      squared error to r + discount (min Q' - alpha log pi(a' | s')). With `relative_value` without alpha, which is then in other units.
+      squared error to r + discount (min Q' - alpha log pi(a' | s')). With `relative_value` targets have no entropy term.
     Actor: mean(alpha log pi - value(s, a_pi)) + bc_weight * behaviour cloning loss; the value is the mean over critics and quantiles (tqc), or the
-      least critic's (sac; with REDQ's subsets the mean over critics). With `relative_value` each row's is divided by itself, a constant.
+      least critic's (sac; with REDQ's subsets the mean over critics). With `relative_value` each row's is
+      divided by max(itself, 0.01), through which no gradient flows: its share of the metric `actor/loss` is then 1, so read `actor/value`.
 
     Args:
       key: random key.
@@ -205,7 +206,7 @@ def _critic_gradient(state: AgentState, target_critics: Params, config: TrainCon
 
 
 def _value(critics: Params, inputs: Array, action: Array, config: TrainConfig) -> Array:
-    """What the actor climbs: (B,)."""
+    """The value of actions, of which the actor climbs the mean, absolute or relative to itself: (B,)."""
     if config.agent.base == "tqc":
         return mean_return(critics, inputs, action, config.agent)
     values = apply_critics(critics, inputs, action, config.agent)[:, 0]

@@ -1,11 +1,12 @@
 """Configs by name: the four models of the thesis, under the project's own recipe, the thesis's settings, the original code's, or those of RLPD.
 
-    default    the project's own recipe: one for all tasks
+    default    the project's own recipe: one for all tasks, and for bc another
     thesis     the hyperparameters of the thesis's appendix, on plain correct code
     original   the same, with the quirks of the original implementation that explain its published figures
     rlpd       efficient online reinforcement learning with offline data (Ball et al., 2023), as far as the fields can say it, see `_rlpd`
 
-The default is `TrainConfig()`, whatever the task is called. What differs between tasks follows from what they are and from the demonstrations:
+The default is `TrainConfig()`, for bc with two wide layers and few steps, whatever the task is called. What differs between tasks follows from what
+they are and from the demonstrations:
 
     action_hold            from the median length of the demonstrations (`core.holding.longest_hold`)
     updates_per_iteration  one gradient step for every 4 environment steps
@@ -87,7 +88,7 @@ def _default(algo: Algorithm, env: Environment) -> TrainConfig:
     """The project's own recipe."""
     goal = _goals(env)
     if algo == "bc":
-        # Two wide layers imitate better than four narrow ones, and soon: on cables 1,000 gradient steps are best (docs/cables.md).
+        # Two wide layers imitate better than four narrow ones, and sooner (docs/cables.md).
         agent = AgentConfig(net_arch=(256, 256))
         return TrainConfig(algo="bc", steps=1_500, eval_every=250, batch=BatchConfig(n_step=1), goal=goal, agent=agent)
     return TrainConfig(goal=goal, batch=_batch(env))

@@ -24,6 +24,7 @@ from probe import (
 
 from hindrl_jax.config import AgentConfig
 from hindrl_jax.core import agent as agents
+from hindrl_jax.core.networks import apply_actor
 
 BASES = {"tqc": CONFIG, "sac": with_agent(base="sac")}
 
@@ -185,7 +186,7 @@ def test_weight_of_cloning_by_hand():
 
 
 def test_relative_value_weighs_every_row_by_its_own_size(monkeypatch):
-    given = np.where(np.arange(B) % 2, 0.5, 0.002)  # the second is below the least size, 0.01
+    given = np.tile([0.5, 0.002, -0.3, 0.5], B // 4)  # the second and the third are below the least size, 0.01
 
     def value(critics, inputs, action, config):
         return jnp.asarray(given, jnp.float32) + action[0] - jax.lax.stop_gradient(action[0])
@@ -194,15 +195,15 @@ def test_relative_value_weighs_every_row_by_its_own_size(monkeypatch):
     start = fresh_agent(jax.random.key(0)).replace(log_alpha=jnp.asarray(-30.0))
     start = start.replace(actor=with_constant_action(start.actor, 0.6))
     gradient, metrics = agents._actor_gradient(start, SCHEDULE, with_agent(relative_value=True), columns())
-    np.testing.assert_allclose(metrics["actor/loss"], -0.5 * (1.0 + 0.2), atol=1e-5)
-    np.testing.assert_allclose(metrics["actor/value"], 0.5 * (0.5 + 0.002), rtol=1e-5)
-    # Its gradient is that of the logarithm: d(v / |v|) = dv / v, here dv = da, and a = tanh m has the derivative 1 - 0.6^2 = 0.64.
-    np.testing.assert_allclose(gradient["params"]["Dense_1"]["bias"][0], -0.64 * 0.5 * (1 / 0.5 + 1 / 0.01), rtol=1e-5)
+    np.testing.assert_allclose(metrics["actor/loss"], -(1.0 + 0.2 - 30.0 + 1.0) / 4, rtol=1e-5)
+    np.testing.assert_allclose(metrics["actor/value"], np.mean(given), rtol=1e-5)
+    # The gradient of v / max(v, 0.01), the divisor being constant: here dv = da, and a = tanh m has the derivative 1 - 0.6^2 = 0.64.
+    np.testing.assert_allclose(gradient["params"]["Dense_1"]["bias"][0], -0.64 * (2 / 0.5 + 2 / 0.01) / 4, rtol=1e-5)
 
 
 @pytest.mark.parametrize("base", BASES)
-def test_targets_leave_entropy_out_where_its_weight_is_in_other_units(base):
-    # The critics are constant, and rewards 0: by hand a target is 0.7 times their value, plus the entropy where it counts.
+def test_relative_value_leaves_entropy_out_of_targets(base):
+    # The critics are constant, rewards 0 and alpha 1: by hand a target is 0.7 (0.5 - log pi), or 0.7 times 0.5 where entropy does not count.
     state = fresh_agent(jax.random.key(0), BASES[base]).replace(log_alpha=jnp.asarray(0.0))
     critics = with_constant_critics(state, (0.5, 0.5), target=True).target_critics
     block = columns(discount=jnp.full(B, 0.7))
@@ -210,7 +211,8 @@ def test_targets_leave_entropy_out_where_its_weight_is_in_other_units(base):
         agents._targets(state, critics, with_agent(BASES[base], relative_value=relative_value), block) for relative_value in (True, False)
     )
     np.testing.assert_allclose(relative, np.full(relative.shape, 0.35), rtol=1e-5)
-    assert np.abs(absolute - 0.35).min() > 0.01
+    _, log_prob = apply_actor(state.actor, block.next_inputs, BASES[base].agent, action_dim=1).at(block.next_noise)
+    np.testing.assert_allclose(absolute, np.broadcast_to(0.7 * (0.5 - log_prob), absolute.shape), rtol=1e-5)
 
 
 def test_with_subsets_sac_climbs_the_mean_of_all_critics():
