@@ -171,7 +171,8 @@ def _stop(result: Result, number: int, writer: RunWriter | SweepWriter, checkpoi
     else:
         checkpoints.save(result)
         said = f"go on with `hindrl {'sweep' if isinstance(writer, SweepWriter) else 'train'} --resume {shlex.quote(str(writer.path))}`"
-    print(f"hindrl: stopped after {result.steps_done:,} of {result.config.num_steps:,} steps; {said}", file=sys.stderr)
+    counted = "steps" if result.config.learns_from_rollouts else "updates"
+    print(f"hindrl: stopped after {result.steps_done:,} of {result.config.num_steps:,} {counted}; {said}", file=sys.stderr)
     sys.exit(128 + number)
 
 
