@@ -133,7 +133,7 @@ def test_links_to_sources_lead_to_pages_on_the_site(site):
     }
     for name, target in pages.items():
         assert f'href="{target}"' in (site / "site" / name).read_text().partition("<article")[2], name
-    assert "planar_arm.py</code>. Four parts" in (site / "site" / "tutorial.html").read_text()  # which has no page
+    assert "planar_arm.py</code>. Six parts" in (site / "site" / "tutorial.html").read_text()  # which has no page
 
 
 @pytest.fixture
