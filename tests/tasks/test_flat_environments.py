@@ -17,7 +17,7 @@ from hindrl_jax import cli
 from hindrl_jax.base.environments import Environment, action_to_env
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.steppers import SimulationFailed
-from hindrl_jax.cli.training import nothing_solved
+from hindrl_jax.cli.training import advice
 from hindrl_jax.demonstrations.convert import load
 from hindrl_jax.runs.checkpoints import Checkpoints
 from hindrl_jax.tasks.success import SuccessRule
@@ -254,7 +254,9 @@ def test_the_commands_train_evaluate_film_and_say(file, tmp_path, capsys):
     assert (tmp_path / "film.gif").stat().st_size > 0
     cli.main(["demos", "info", str(file)])
     assert "5 demonstrations, 5 solved" in capsys.readouterr().out
-    assert "--demo-reset-ratio" not in nothing_solved(run.spec)  # which would be refused
+    said = " ".join(advice(run.spec, [{"returned_success": 0.0}], tmp_path))
+    assert "a longer run: --steps" in said
+    assert "--demo-reset-ratio" not in said  # which would be refused
     assert "give different ones from 0 to 3" in refusal(capsys, "train", "--demos", file, "--achieved-goal-indices", "0", "9")
     assert "which are discrete" in refusal(capsys, "train", "--env", "gymnasium:CartPole-v1")
 
