@@ -148,6 +148,7 @@ def run(arm, tmp_path_factory):
     }
     policies = make_agents(jax.random.split(jax.random.key(0), 2), InputScale(**scale))
     result = SimpleNamespace(
+        configs=(config, config),
         returned=SimpleNamespace(actor=policies.average_actor, noise=np.zeros(2)),
         guidance=SimpleNamespace(behavioural_goals=goals, epsilon=jnp.ones((2, env.goal_dim))),
         state=SimpleNamespace(agent=policies),
