@@ -12,6 +12,7 @@ from typing import Any, Literal
 import jax
 import tyro
 from rich.console import Console
+from rich.table import Table
 
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.cli.help_pages import Group, full_page, groups_of, missing, nearest, short_page
@@ -21,10 +22,16 @@ from hindrl_jax.tasks.registry import TASKS, did_you_mean, make
 _TYRO = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
 ENV_HELP = "The environment; `hindrl envs` lists them. One of Gymnasium is gymnasium:ID, as in gymnasium:FetchReach-v4."
 Brief = tuple[Mapping[str, Mapping[str, str]], Sequence[str]]  # as `short_page` takes them
-console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
+_PLAIN: dict[str, Any] = dict(highlight=False, soft_wrap=True, markup=False, emoji=False)
+console = Console(**_PLAIN)
 
 
 MOST_SEEDS, MOST_EPISODES = 65_536, 1_000_000
+
+
+def print_table(table: Table, *, least_width: int) -> None:
+    """Prints a table in so many characters at least, also where the terminal is narrower: a cut name or a cell in two lines is hard to read."""
+    Console(**_PLAIN, width=max(console.width, least_width)).print(table)
 
 
 def check_episodes(episodes: int, doing: str) -> None:

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 import tyro
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.files import disk_trouble
-from hindrl_jax.cli.common import console, parse
+from hindrl_jax.cli.common import console, parse, print_table
 from hindrl_jax.plotting.statistics import Interval
 from hindrl_jax.reporting.compare import Comparison, changes, find_runs, read_runs, remarks, write_csv
 from hindrl_jax.reporting.compare import compare as compared_runs
@@ -33,7 +32,7 @@ _UNSET = {  # what a field means where it is None
     "stop_at": "never",
     "updates_per_iteration": "by default",
 }
-_TABLE_WIDTH = 160  # at most, also where the terminal is narrower: a cell in two lines is hard to compare
+_TABLE_WIDTH = 160  # characters
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +61,7 @@ def compare(arguments: list[str]) -> None:
         raise UserError("nothing to compare: give the directories of two or more runs, or of a sweep")
     runs = read_runs(find_runs(options.directories))
     compared = compared_runs(runs)
-    Console(highlight=False, soft_wrap=True, markup=False, emoji=False, width=max(console.width, _TABLE_WIDTH)).print(_table(compared))
+    print_table(_table(compared), least_width=_TABLE_WIDTH)
     for run in runs[1:]:
         console.print(f"{run.label}: {_changes_line(changes(run, runs[0]))}")
     for line in remarks(compared):

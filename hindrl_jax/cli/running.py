@@ -171,8 +171,7 @@ def _stop(result: Result, number: int, writer: RunWriter | SweepWriter, checkpoi
     else:
         checkpoints.save(result)
         said = f"go on with `hindrl {'sweep' if isinstance(writer, SweepWriter) else 'train'} --resume {shlex.quote(str(writer.path))}`"
-    counted = "steps" if result.config.learns_from_rollouts else "updates"
-    print(f"hindrl: stopped after {result.steps_done:,} of {result.config.num_steps:,} {counted}; {said}", file=sys.stderr)
+    print(f"hindrl: stopped after {result.steps_done:,} of {result.config.num_steps:,} {result.steps_unit}; {said}", file=sys.stderr)
     sys.exit(128 + number)
 
 

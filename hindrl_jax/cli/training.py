@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from hindrl_jax.base.environments import Restorable, can_step
-from hindrl_jax.cli.common import console, peek
+from hindrl_jax.cli.common import console, peek, print_table
 from hindrl_jax.cli.hosts import joined_hosts
 from hindrl_jax.cli.running import check_unfinished, checkpoints_of, default_out, reporters_of, run, speed_line
 from hindrl_jax.cli.train_options import is_number, parse_resume, parse_train
@@ -23,7 +22,7 @@ from hindrl_jax.runs.spec import FROM_PYTHON, SUMMARY, RunSpec, read_spec
 from hindrl_jax.runs.writer import RunWriter
 from hindrl_jax.training.result import SOLVED, Row
 
-_TABLE_WIDTH = 92  # at least: a column whose name is cut is hard to read
+_TABLE_WIDTH = 92  # characters
 _GOOD = 0.8  # mean success of the returned policies from which on nobody needs advice
 
 
@@ -42,8 +41,7 @@ def train(arguments: list[str]) -> None:
         result = run(spec, [spec.config], writer if writes else None, checkpoints_of(out, options))
         if writes:
             summary = writer.finish(result)
-            width = max(console.width, _TABLE_WIDTH)
-            Console(highlight=False, soft_wrap=True, markup=False, emoji=False, width=width).print(_summary_table(summary, spec.config))
+            print_table(_summary_table(summary, spec.config), least_width=_TABLE_WIDTH)
             for line in said_of_never(summary["seeds"], result.rows):
                 console.print(line)
             console.print(speed_line(summary))

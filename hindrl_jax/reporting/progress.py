@@ -125,15 +125,14 @@ def bar(result: Result, began: tuple[int, float] | None, *, width: int, unicode:
       unicode: draw with more than ASCII.
     """
     done, total = min(result.steps_done, result.config.num_steps), result.config.num_steps
-    unit = "steps" if result.config.learns_from_rollouts else "updates"
-    words = f" {done:,}/{total:,} {unit}"
+    words = f" {done:,}/{total:,} {result.steps_unit}"
     success = result.latest_success()
     if success is not None:
         words += f", success {success:.0%}"
     if began is not None and result.steps_done > began[0] and result.train_seconds > began[1]:
         speed = (result.steps_done - began[0]) / (result.train_seconds - began[1])
         left = round((total - done) / speed)
-        words += f", {len(result.seeds) * speed:,.0f} {unit}/s, {left // 60}:{left % 60:02d} left"
+        words += f", {len(result.seeds) * speed:,.0f} {result.steps_unit}/s, {left // 60}:{left % 60:02d} left"
     length = min(max(width - len(words), _WIDTHS[0]), _WIDTHS[1])
     full = round(length * done / total)
     glyph, rest = "━─" if unicode else "#."

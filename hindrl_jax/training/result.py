@@ -118,6 +118,11 @@ class Result:
         return self.env_steps if self.config.learns_from_rollouts else self.updates
 
     @property
+    def steps_unit(self) -> str:
+        """In a word, what `steps_done` counts."""
+        return "steps" if self.config.learns_from_rollouts else "updates"
+
+    @property
     def moment(self) -> Moment:
         """How far the experiment is."""
         return Moment(self.env_steps, self.updates, self.train_seconds)

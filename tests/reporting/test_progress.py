@@ -33,6 +33,7 @@ def result(done, *, every=100, seeds=(0, 1), algo="hindrl", finished=False):
         seeds=seeds,
         rows=rows,
         steps_done=done,
+        steps_unit="updates" if algo == "bc" else "steps",
         train_seconds=done / 100,
         final_success=np.zeros(len(seeds)) if finished else None,
         latest_success=lambda: float(np.mean([row.success for row in rows[-len(seeds) :]])) if rows else None,
