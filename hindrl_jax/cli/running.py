@@ -29,6 +29,7 @@ from hindrl_jax.demonstrations.convert import load
 from hindrl_jax.reporting.progress import ProgressBar
 from hindrl_jax.reporting.reporters import REPORTERS
 from hindrl_jax.runs.checkpoints import Checkpoints
+from hindrl_jax.runs.films import Films
 from hindrl_jax.runs.reporter import Reporter
 from hindrl_jax.runs.spec import CHECKPOINTS, FROM_PYTHON, RunSpec
 from hindrl_jax.runs.sweep import SweepWriter
@@ -83,9 +84,19 @@ def demonstrations_of(spec: RunSpec) -> list[Episodes]:
     return [episodes] * len(spec.seeds)
 
 
-def run(spec: RunSpec, configs: Sequence[TrainConfig], writer: RunWriter | SweepWriter | None, checkpoints: Checkpoints | None) -> Result:
+def run(
+    spec: RunSpec,
+    configs: Sequence[TrainConfig],
+    writer: RunWriter | SweepWriter | None,
+    checkpoints: Checkpoints | None,
+    render_every: int | None = None,
+) -> Result:
     """Trains all seeds of all configs at once, with a progress bar; each of the writer's runs gets those of its config. Without it, quietly."""
     resumes = writer is not None and writer.resume
+    num_seeds = len(spec.seeds)
+    films: list[Films] = []
+    if writer is not None and render_every is not None:
+        films = [Films(of_setting.path, spec.env, render_every, index=index * num_seeds) for index, of_setting in enumerate(writer.runs)]
     num_demos = int(spec.demos) if is_number(spec.demos) else 1
     check_demonstrations(num_demos)
     check_memory(spec.env, configs[0], len(spec.seeds) * len(configs), num_demos)
@@ -98,7 +109,6 @@ def run(spec: RunSpec, configs: Sequence[TrainConfig], writer: RunWriter | Sweep
             if is_number(spec.demos) and writer is not None:
                 waiting.wait("recording demonstrations")
             demonstrations = demonstrations_of(spec)
-    num_seeds = len(spec.seeds)
     seeds = f"seed {spec.seeds[0]}" if num_seeds == 1 else f"{num_seeds} seeds from {spec.seeds[0]}"
     settings = f", {len(configs)} settings" if len(configs) > 1 else ""
     runs: dict[str, Any] = dict(seeds=spec.seeds * len(configs), config=[config for config in configs for _ in spec.seeds])
@@ -138,6 +148,8 @@ def run(spec: RunSpec, configs: Sequence[TrainConfig], writer: RunWriter | Sweep
             for index, of_setting in enumerate(writer.runs):
                 of_setting.report(result.rows_of(slice(index * num_seeds, (index + 1) * num_seeds)))
             progress(result)
+            for of_setting_films in films:
+                of_setting_films.film_when_due(result)
             if checkpoints is not None:
                 checkpoints.save_when_due(result)
             if stop_signals.received is not None and result.final_success is None:

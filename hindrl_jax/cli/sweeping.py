@@ -37,7 +37,7 @@ def sweep(arguments: list[str]) -> None:
         writer = checked(lambda: SweepWriter(out, spec, settings, overwrite=options.overwrite, reporters=reporters_of(options)))
     with contextlib.closing(writer), joined_hosts(options) as writes:
         configs = [setting.spec.config for setting in writer.runs]
-        result = run(spec, configs, writer if writes else None, checkpoints_of(out, options))
+        result = run(spec, configs, writer if writes else None, checkpoints_of(out, options), options.render_every)
         if writes:
             console.print(_sweep_table(writer.finish(result), list(settings[0])))
             console.print(speed_line(summarise(result)))

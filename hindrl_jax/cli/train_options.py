@@ -73,6 +73,9 @@ class TrainOptions:
     checkpoint_every: float = 60.0
     """Seconds between two checkpoints, which are also written at Ctrl-C and SIGTERM, and removed at the end; 0 writes none. Not with several
     hosts."""
+    render_every: int | None = None
+    """Also film an episode of the first seed every so many steps, into the folder films of the run's directory: always the same episode, with the
+    policy of that moment. Drawing counts into the run's seconds."""
     tensorboard: bool = False
     """Also write event files for TensorBoard, in the run's directory: all metrics for each seed, and their mean. Needs the package tensorboard."""
     wandb: bool = False
@@ -105,6 +108,8 @@ class ResumeOptions:
     """Directory of the run or of the sweep."""
     checkpoint_every: float = TrainOptions.checkpoint_every
     """Seconds between two checkpoints; 0 writes none."""
+    render_every: int | None = None
+    """Steps between two films from here on; they are not made without saying so."""
     tensorboard: bool = False
     """Also write event files for TensorBoard, with what went before; without saying so where the run did before."""
     wandb: bool = False

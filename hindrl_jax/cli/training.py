@@ -38,7 +38,7 @@ def train(arguments: list[str]) -> None:
         out = options.out or default_out(spec)
         writer = RunWriter(out, spec, overwrite=options.overwrite, reporters=reporters_of(options))
     with contextlib.closing(writer), joined_hosts(options) as writes:
-        result = run(spec, [spec.config], writer if writes else None, checkpoints_of(out, options))
+        result = run(spec, [spec.config], writer if writes else None, checkpoints_of(out, options), options.render_every)
         if writes:
             summary = writer.finish(result)
             print_table(_summary_table(summary, spec.config), least_width=_TABLE_WIDTH)

@@ -5,6 +5,7 @@
     summary.json      the outcome per seed and the totals
     parameters.npz    networks and behavioural goals, leading axis the seeds; no pickle
     curve.png, episode.gif
+    films/            with --render-every, episodes along the run
     checkpoint/       while it is under way, or if it was stopped: what it needs to go on
 
 Each file is written whole or not at all, metrics.csv row by row.
@@ -25,7 +26,7 @@ from hindrl_jax.tasks.registry import did_you_mean, full_name, make
 from hindrl_jax.training.result import Row
 
 CONFIG, METRICS, SUMMARY, PARAMETERS = "config.json", "metrics.csv", "summary.json", "parameters.npz"
-CURVE, EPISODE = "curve.png", "episode.gif"
+CURVE, EPISODE, FILMS = "curve.png", "episode.gif", "films"
 CHECKPOINTS, LOCK = "checkpoint", ".lock"
 SWEEP_SETTINGS, SWEEP, SWEEP_CURVES = "sweep.json", "sweep.csv", "sweep.png"
 FROM_PYTHON = "given from Python"

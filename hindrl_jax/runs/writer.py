@@ -26,7 +26,21 @@ from hindrl_jax.core.agent import policy
 from hindrl_jax.plotting import curves as plots
 from hindrl_jax.runs.reader import load_run
 from hindrl_jax.runs.reporter import Reporter
-from hindrl_jax.runs.spec import CHECKPOINTS, CONFIG, CURVE, EPISODE, FROM_PYTHON, LOCK, METRICS, PARAMETERS, ROW_FIELDS, RUN_FILES, SUMMARY, RunSpec
+from hindrl_jax.runs.spec import (
+    CHECKPOINTS,
+    CONFIG,
+    CURVE,
+    EPISODE,
+    FILMS,
+    FROM_PYTHON,
+    LOCK,
+    METRICS,
+    PARAMETERS,
+    ROW_FIELDS,
+    RUN_FILES,
+    SUMMARY,
+    RunSpec,
+)
 from hindrl_jax.tasks.registry import viewer
 from hindrl_jax.training.result import Result, Row
 
@@ -87,7 +101,8 @@ class RunWriter:
             for name in RUN_FILES:
                 (self.path / name).unlink(missing_ok=True)
             if not self.resume:
-                shutil.rmtree(self.path / CHECKPOINTS, ignore_errors=True)
+                for folder in (CHECKPOINTS, FILMS):
+                    shutil.rmtree(self.path / folder, ignore_errors=True)
             write_text_atomically(self.path / CONFIG, json.dumps(self.spec.to_json(), indent=2) + "\n")
         self.started = True
 
@@ -140,7 +155,7 @@ class RunWriter:
 
     def files(self) -> list[str]:
         """Names of what has been written."""
-        names = [*RUN_FILES, *(reporter.folder for reporter in self.reporters)]
+        names = [*RUN_FILES, FILMS, *(reporter.folder for reporter in self.reporters)]
         return [name for name in names if (self.path / name).exists()]
 
 
