@@ -216,7 +216,15 @@ def _warn_of_what_has_no_effect(before: Any, section: Any, config: TrainConfig |
         if dataclasses.is_dataclass(value):
             _warn_of_what_has_no_effect(value_before, value, config)
         elif value != value_before and (reason := without_effect(config, field.name)):
-            warnings.warn(f"{field.name} = {value} changes nothing: {reason}", stacklevel=2)
+            warnings.warn(f"{_as_given(field.name, value)} changes nothing: {reason}", stacklevel=2)
+
+
+def _as_given(name: str, value: Any) -> str:
+    """A field and its value as a flag of the command line."""
+    flag = name.replace("_", "-")
+    if isinstance(value, bool):
+        return f"--{flag}" if value else f"--no-{flag}"
+    return " ".join([f"--{flag}", *map(str, value if isinstance(value, tuple) else (value,))])
 
 
 def parse_resume(arguments: list[str], program: str) -> ResumeOptions:

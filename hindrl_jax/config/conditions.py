@@ -74,8 +74,8 @@ CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
     ),
     ("q_filter", _clones, "nothing is cloned: raise --bc-weight"),
     ("bc_loss bc_action", lambda c: _clones(c) or c.clones_first, "nothing is cloned: raise --bc-weight"),
-    ("epsilon_steps epsilon_deviations", lambda c: c.goal.epsilon is None, "epsilon itself is given: set it to None"),
-    ("epsilon_deviations", lambda c: c.goal.epsilon_steps > 0, "epsilon depends on it only for epsilon_steps > 0: add --epsilon-steps 5"),
+    ("epsilon_steps epsilon_deviations", lambda c: c.goal.epsilon is None, "epsilon itself is given: set it to None (--epsilon None)"),
+    ("epsilon_deviations", lambda c: c.goal.epsilon_steps > 0, "epsilon depends on it only where pairs are some steps apart: add --epsilon-steps 5"),
     (
         "epsilon_steps epsilon_deviations epsilon",
         _tests_goals,
