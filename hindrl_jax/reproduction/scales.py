@@ -123,7 +123,7 @@ def _config(setting: Setting, recipe: Recipe, scale: ScaleName) -> TrainConfig:
 
 COMPILATION, GRADIENT_STEP, BATCH_ROW, OF_CLONING = 14.0, 1.0e-3, 11e-6, 0.2
 """Seconds, of one core of an AMD EPYC: to compile a cell; of a gradient step, and of each row of its batch, rollouts and evaluations included;
-and the share of these that a step of cloning takes. What docs/performance.md and docs/results.md measured, roughly."""
+and the share of these that a step of cloning takes. What docs/performance.md and docs/earlier-results.md measured, roughly."""
 
 
 def seconds_of(spec: RunSpec, *, cores: int) -> float:
