@@ -144,7 +144,7 @@ def run(
                 begin(result)
             elif not learning:
                 learning = True
-                progress.say(f"first updates after {time.perf_counter() - STARTED:.1f} s")
+                progress.say(f"first updates after {time.perf_counter() - STARTED:.1f} s; the seconds below count training only")
             for index, of_setting in enumerate(writer.runs):
                 of_setting.report(result.rows_of(slice(index * num_seeds, (index + 1) * num_seeds)))
             progress(result)
