@@ -118,7 +118,10 @@ def _act(key: Array, policy: Policy, observation: Array, goal: Array, env: Envir
     """(B, D), (B, G) -> (B, A) in the environment's units, whole numbers where it takes such."""
     whole, env = takes_whole_actions(env), _decisions(env, config)
     action = action_to_env(make_policy(policy, env, config)(key, observation, goal), env)
-    return jnp.clip(jnp.rint(action), jnp.ceil(env.action_low), jnp.floor(env.action_high)) if whole else action
+    if not whole:
+        return action
+    low, high = (jnp.broadcast_to(bound, action.shape) for bound in (jnp.ceil(env.action_low), jnp.floor(env.action_high)))
+    return jnp.clip(jnp.rint(action), low, high)
 
 
 def _value(critics: Params, policy: Policy, observation: Array, goal: Array, action: Array, env: Environment, config: TrainConfig) -> Array:

@@ -38,7 +38,8 @@ def untrained(env=ENV, noise=0.0, **agent_fields):
     dims = dict(observation=env.observation_dim, goal=env.goal_dim)
     scale = {name: rng.uniform(0.5, 2.0, dim) for name, dim in dims.items()} | {f"{name}_centre": rng.normal(size=dim) for name, dim in dims.items()}
     scale = InputScale(**{name: jnp.asarray(values, jnp.float32) for name, values in scale.items()})
-    states = jax.vmap(lambda key: agent.init(key, scale, config, action_dim=decisions.action_dim))(jax.random.split(jax.random.key(3), 2))
+    begin = jax.jit(jax.vmap(lambda key: agent.init(key, scale, config, action_dim=decisions.action_dim)))
+    states = begin(jax.random.split(jax.random.key(3), 2))
     policies = agent.policy(states, average=True).replace(noise=jnp.full(2, noise))
     goals = GoalTable(goals=jnp.asarray(rng.normal(size=(2, 3, env.goal_dim)), jnp.float32), count=jnp.array([3, 3]))
     return Run(Path("runs/mine"), RunSpec(env, config, "1", (5, 7)), policies, goals, states.critics)
@@ -69,7 +70,7 @@ def test_a_policy_in_numpy_is_that_in_jax(name):
     policy, plain = run.policy(7), run.numpy_policy(7)
     observation, goal = draws(env, 4)
     shape = (3, env.action_dim) if name == "chunks" else (env.action_dim,)
-    action = policy(observation, goal)
+    action = np.asarray(policy(observation, goal))
     chex.assert_shape(action, (4, *shape))
     np.testing.assert_allclose(plain(observation, goal), action, atol=2e-6)
     assert np.abs(action - run.policy(5)(observation, goal)).max() > 1e-3
@@ -84,6 +85,19 @@ def test_a_policy_in_numpy_is_that_in_jax(name):
     else:
         np.testing.assert_array_equal(policy(observation), policy(observation, run.behavioural_goals.goals[1, 0]))
         np.testing.assert_allclose(plain(observation), policy(observation), atol=2e-6)
+
+
+def test_whole_numbers_are_given_where_a_task_takes_such():
+    env = hindrl.make("gymnasium:odd_env:Odd-v0", action="int8", low=[-3, 2], high=[3, 2], dims=2, threshold=5.0)
+    run = untrained(env)
+    observation, goal = (30.0 * values for values in draws(env, 50))
+    action = np.asarray(run.policy()(observation, goal))
+    np.testing.assert_array_equal(action, np.rint(action))
+    assert -3 in action[:, 0]
+    assert len(set(action[:, 0])) > 3
+    assert np.abs(action[:, 0]).max() == 3
+    assert set(action[:, 1]) == {2}
+    np.testing.assert_array_equal(run.numpy_policy()(observation, goal), action)
 
 
 def test_policies_may_be_called_within_compiled_programs():
@@ -219,10 +233,10 @@ def test_a_run_with_networks_and_losses_of_ones_own(tmp_path):
     own = dict(actor_network=Tanh, critic_network=Tanh, actor_loss=calm, critic_loss=cautious)
     config = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, **own))
     result = hindrl.fit(ENV, hindrl.record_demonstrations(ENV, 2), config, seeds=[300])
-    assert result.returned.actor["params"]["Dense_0"]["kernel"].shape[-1] == 5
+    assert result.returned.actor["params"]["Dense_1"]["kernel"].shape[-1] == 5
     hindrl.save_run(tmp_path / "run", result)
     run = hindrl.load_run(tmp_path / "run")
-    assert run.spec.config == config
+    assert run.spec.config == result.config
     observation, _ = draws(ENV, 4)
     assert run.policy()(observation).shape == (4, ENV.action_dim)
     assert np.isfinite(run.value()(observation)).all()
