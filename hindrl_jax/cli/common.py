@@ -133,7 +133,8 @@ _OWN_FUNCTIONS = tyro.constructors.ConstructorRegistry()
 @_OWN_FUNCTIONS.primitive_rule
 def _function_by_name(type_info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
     """How tyro reads MODULE:NAME for a field that holds a function."""
-    if type_info.type_origin is not Callable:
+    origin: Any = type_info.type_origin
+    if origin is not Callable:
         return None
     return tyro.constructors.PrimitiveConstructorSpec(
         nargs=1,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -114,6 +115,7 @@ def _decisions(env: Environment, config: TrainConfig) -> Environment:
     return hold(env, config.num_held, chunks=config.action_chunks)
 
 
+@functools.partial(jax.jit, static_argnums=(4, 5))
 def _act(key: Array, policy: Policy, observation: Array, goal: Array, env: Environment, config: TrainConfig) -> Array:
     """(B, D), (B, G) -> (B, A) in the environment's units, whole numbers where it takes such."""
     whole, env = takes_whole_actions(env), _decisions(env, config)
@@ -124,14 +126,12 @@ def _act(key: Array, policy: Policy, observation: Array, goal: Array, env: Envir
     return jnp.clip(jnp.rint(action), low, high)
 
 
+@functools.partial(jax.jit, static_argnums=(5, 6))
 def _value(critics: Params, policy: Policy, observation: Array, goal: Array, action: Array, env: Environment, config: TrainConfig) -> Array:
     """(B, D), (B, G), (B, A) -> (B,)"""
     env = _decisions(env, config)
     inputs = network_inputs(observation, env.achieved_goal(observation), goal, policy.scale, config)
     return action_value(critics, inputs, action_from_env(action, env), config)
-
-
-_act, _value = jax.jit(_act, static_argnums=(4, 5)), jax.jit(_value, static_argnums=(5, 6))
 
 
 def _inputs(observation: Any, goal: Any, of: TrainedPolicy) -> tuple[Array, Array, tuple[int, ...]]:

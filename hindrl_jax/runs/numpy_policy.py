@@ -124,7 +124,8 @@ def _checked(values: Any, dim: int, what: str, task: str) -> np.ndarray:
 
 def save(path: Any, arrays: dict[str, np.ndarray], facts: dict[str, Any]) -> None:
     """Writes what `load` reads; no pickle."""
-    np.savez(path, facts=np.array(json.dumps(facts)), **arrays)
+    content: dict[str, Any] = {"facts": np.array(json.dumps(facts)), **arrays}
+    np.savez(path, **content)
 
 
 def load(path: Any) -> NumpyPolicy:
