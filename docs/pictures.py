@@ -1,5 +1,5 @@
-"""Draws the pictures of README and of the pages: docs/how_it_works.png, docs/environments.png, docs/epsilon_filter.png and, of the runs that
-are there, docs/panda.gif, docs/grid.gif and docs/grid_curve.png.
+"""Draws the pictures of README and of the pages: docs/how_it_works.png, docs/environments.png, docs/epsilon_filter.png, docs/values.png and,
+of the runs that are there, docs/panda.gif, docs/grid.gif and docs/grid_curve.png.
 
     hindrl train --env FixedGridPickAndPlace --demos 1 --seed 2 --stop-at 0.98 --out runs/quickstart
     hindrl train --env FixedParameterizedReach --demos 1 --seed 0 --stop-at 0.98 --out runs/reach
@@ -13,6 +13,7 @@ import tempfile
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import matplotlib
 import numpy as np
 from PIL import Image
@@ -21,6 +22,7 @@ from hindrl_jax import cli
 from hindrl_jax.envs.cable import viewer as cable_viewer
 from hindrl_jax.envs.grid import viewer as grid_viewer
 from hindrl_jax.envs.reach import viewer as reach_viewer
+from hindrl_jax.runs.reader import load_run
 from hindrl_jax.tasks.registry import make
 
 matplotlib.use("Agg")
@@ -37,6 +39,7 @@ def main() -> None:
     how_it_works(DOCS / "how_it_works.png")
     environments(DOCS / "environments.png")
     epsilon_filter(DOCS / "epsilon_filter.png")
+    values(DOCS / "values.png")
     for run, film in (("reach", "panda.gif"), ("quickstart", "grid.gif")):
         if (RUNS / run).is_dir():
             cli.main(["render", str(RUNS / run), "--to", str(DOCS / film)])
@@ -104,6 +107,28 @@ def environments(path: Path) -> None:
         together.paste(picture, (x, 0))
         x += picture.width + 20
     together.save(path, optimize=True)
+
+
+def values(path: Path) -> None:
+    """What the critics of the grid's shipped run say along an episode, and with the agent in each cell; the program is that of docs/python.md."""
+    run = load_run("policy:FixedGridPickAndPlace")
+    episode, value, env = run.play(1, key=jax.random.key(300)), run.value(), run.spec.env
+    start = episode.states[0, 0]
+    cells = jnp.stack(jnp.meshgrid(jnp.arange(env.size), jnp.arange(env.size)), axis=-1).reshape(-1, 2)
+    states = jnp.tile(start, (len(cells), 1)).at[:, :2].set(cells)
+    observations = jax.vmap(lambda state: env.observe(env.vector_to_state(jax.random.key(0), state)))(states)
+    figure, (along, over) = plt.subplots(1, 2, figsize=(9, 3.6), dpi=120, layout="constrained")
+    along.plot(value(episode.observations[0, : episode.lengths[0]]), color=RELABELLED, linewidth=2)
+    along.set(title="along an episode", xlabel="step", ylabel="value", ylim=(0, 1.05))
+    along.spines[["top", "right"]].set_visible(False)
+    shown = over.imshow(value(observations).reshape(env.size, env.size), origin="lower")
+    over.plot(*start[2:4], "s", color=DEMO, markersize=9, markeredgecolor="white", label="first object")
+    over.plot(*start[:2], "o", color="white", markersize=8, label="agent, at the beginning")
+    over.set(title="with the agent in each cell", xticks=[], yticks=[])
+    over.legend(loc="upper left", fontsize=8, labelcolor="white", frameon=False)
+    figure.colorbar(shown, label="value")
+    figure.savefig(path, facecolor="white")
+    plt.close(figure)
 
 
 def epsilon_filter(path: Path) -> None:

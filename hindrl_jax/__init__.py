@@ -22,7 +22,7 @@ STARTED = time.perf_counter()  # this package loads before the large ones it use
 # Loaded on first use, since most of them load JAX. A test holds this table and the imports below it together.
 _EXPORTS = {
     "Checkpoints": "hindrl_jax.runs.checkpoints",
-    "ProgressBar": "hindrl_jax.reporting.progress",
+    "ProgressBar": "hindrl_jax.training.progress",
     "Result": "hindrl_jax.training.result",
     "TensorBoardReporter": "hindrl_jax.reporting.reporters",
     "TimeStep": "hindrl_jax.base.types",
@@ -49,7 +49,6 @@ if TYPE_CHECKING:
     from hindrl_jax.base.types import TimeStep as TimeStep
     from hindrl_jax.demonstrations.hdf5 import load_demonstrations as load_demonstrations
     from hindrl_jax.demonstrations.hdf5 import save_demonstrations as save_demonstrations
-    from hindrl_jax.reporting.progress import ProgressBar as ProgressBar
     from hindrl_jax.reporting.reporters import TensorBoardReporter as TensorBoardReporter
     from hindrl_jax.reporting.reporters import WandbReporter as WandbReporter
     from hindrl_jax.runs.checkpoints import Checkpoints as Checkpoints
@@ -60,6 +59,7 @@ if TYPE_CHECKING:
     from hindrl_jax.tasks.registry import make as make
     from hindrl_jax.tasks.registry import register as register
     from hindrl_jax.training.experiment import fit as fit
+    from hindrl_jax.training.progress import ProgressBar as ProgressBar
     from hindrl_jax.training.recording import record_demonstrations as record_demonstrations
     from hindrl_jax.training.recording import record_gymnasium as record_gymnasium
     from hindrl_jax.training.result import Result as Result

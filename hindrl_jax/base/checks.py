@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from types import UnionType
 from typing import Any, ClassVar, Literal, get_args, get_origin, get_type_hints
 
@@ -34,6 +35,8 @@ def _matches(value: object, hint: Any) -> bool:
     if origin is tuple:
         hints = arguments[:1] * len(value) if isinstance(value, tuple) and arguments[-1] is Ellipsis else arguments
         return isinstance(value, tuple) and len(value) == len(hints) and all(map(_matches, value, hints))
+    if origin is Callable:
+        return callable(value)
     if hint is float:
         return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
     if hint is int:
@@ -49,6 +52,8 @@ def _in_words(hint: Any) -> str:
         return " or ".join(_in_words(argument) for argument in arguments)
     if origin is tuple:
         return f"a list, each item {_in_words(arguments[0])}" if arguments[-1] is Ellipsis else f"({', '.join(map(_in_words, arguments))})"
+    if origin is Callable:
+        return "a function"
     return {int: f"a whole number of at most {LARGEST}", float: "a finite number", bool: "true or false", type(None): "none"}.get(
         hint, f"a {hint.__name__}"
     )

@@ -6,7 +6,7 @@ import contextlib
 import io
 import itertools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import jax
@@ -17,6 +17,7 @@ from rich.table import Table
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.cli.help_pages import Group, full_page, groups_of, missing, nearest, short_page
 from hindrl_jax.tasks.from_gymnasium import PREFIX
+from hindrl_jax.tasks.functions import find_function, function_name
 from hindrl_jax.tasks.registry import TASKS, did_you_mean, make
 
 _TYRO = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
@@ -120,10 +121,28 @@ def parse(arguments_class: type[Any], arguments: list[str], program: str, descri
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
-            return tyro.cli(arguments_class, args=arguments, prog=program, config=_TYRO)
+            return tyro.cli(arguments_class, args=arguments, prog=program, config=_TYRO, registry=_OWN_FUNCTIONS)
     except SystemExit:
         said = _in_our_words(_first_sentence(complaint.getvalue()), arguments, program, groups_of(arguments_class))
         raise UserError(f"{said} (see {program} --help)") from None
+
+
+_OWN_FUNCTIONS = tyro.constructors.ConstructorRegistry()
+
+
+@_OWN_FUNCTIONS.primitive_rule
+def _function_by_name(type_info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
+    """How tyro reads MODULE:NAME for a field that holds a function."""
+    origin: Any = type_info.type_origin
+    if origin is not Callable:
+        return None
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="MODULE:NAME",
+        instance_from_str=lambda words: find_function(words[0]),
+        is_instance=callable,
+        str_from_instance=lambda function: [function_name(function)],
+    )
 
 
 _WANTED = {"INT": "a whole number", "FLOAT": "a number", "INT ...": "whole numbers", "FLOAT ...": "numbers", "PATH": "a path"}
@@ -149,6 +168,9 @@ def _in_our_words(said: str, arguments: Sequence[str], program: str, groups: Seq
         return f"{program} needs {', '.join(lacking)}" if lacking else said
     if said.startswith("Error parsing --") and wanted != "a value":
         return f"{given} is not usable: give {wanted}"
+    function = re.search(r"- collections\.abc\.Callable\[.*?\]: (.*)$", said)
+    if function:
+        return f"{flag}: {function[1]}"
     choices = re.search(r"^invalid choice '(.*)' for argument .*Expected one of \((.*?),?\)\.$", said)
     if choices:
         known = re.findall(r"'([^']*)'", choices[2])

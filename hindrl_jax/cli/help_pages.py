@@ -16,6 +16,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from hindrl_jax.tasks.functions import function_name, is_function
+
 _MARKER = typing.get_args(tyro.conf.Positional[int])[1]
 _KINDS = {int: "INT", float: "FLOAT", str: "TEXT"}
 _INDENT = 6  # of a flag's text, in characters
@@ -121,6 +123,8 @@ def _default_of(field: dataclasses.Field[Any]) -> Any:
 
 
 def _typed(value: Any) -> str:
+    if callable(value):
+        return function_name(value)
     return " ".join(map(str, value)) if isinstance(value, tuple | list) else str(value)
 
 
@@ -133,6 +137,8 @@ def _values(hint: Any) -> str:
         return "{" + ",".join(map(str, arguments)) + "}"
     if origin is tuple:
         return f"{_values(arguments[0])} ..." if Ellipsis in arguments else " ".join(map(_values, arguments))
+    if is_function(hint):
+        return "MODULE:NAME"
     if origin in (typing.Union, types.UnionType):
         return "|".join(map(_values, arguments))
     return _KINDS.get(hint, "PATH" if getattr(hint, "__name__", "") == "Path" else "TEXT")

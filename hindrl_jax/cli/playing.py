@@ -12,10 +12,10 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from hindrl_jax.cli.common import check_episodes, console, counted, episode_key, parse
-from hindrl_jax.reporting.progress import ProgressBar
 from hindrl_jax.runs.reader import load_run
 from hindrl_jax.runs.shipped import PREFIX
 from hindrl_jax.training.playing import plays_one_by_one
+from hindrl_jax.training.progress import ProgressBar
 
 
 @dataclasses.dataclass(frozen=True)

@@ -200,7 +200,7 @@ def _train_all(to_train: Sequence[Cell], say: Callable[[Cell], str], *, weight: 
 
 
 def _bars() -> Progress:
-    """A place for the bars of trainings that follow each other; `hindrl_jax.reporting.progress` has that of a single one."""
+    """A place for the bars of trainings that follow each other; `hindrl_jax.training.progress` has that of a single one."""
     columns = ("{task.description}", BarColumn(), "{task.completed:,.0f}/{task.total:,.0f} steps", "{task.fields[rates]}", "left")
     return Progress(*(TextColumn(c) if isinstance(c, str) else c for c in columns), TimeRemainingColumn(), console=console, transient=True)
 

@@ -26,7 +26,6 @@ from hindrl_jax.cli.signals import StopSignals
 from hindrl_jax.cli.train_options import ResumeOptions, TrainOptions, is_number
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.demonstrations.convert import load
-from hindrl_jax.reporting.progress import ProgressBar
 from hindrl_jax.reporting.reporters import REPORTERS
 from hindrl_jax.runs.checkpoints import Checkpoints
 from hindrl_jax.runs.films import Films
@@ -38,6 +37,7 @@ from hindrl_jax.tasks.checking import check_environment
 from hindrl_jax.tasks.registry import full_name
 from hindrl_jax.training.checks import check_demonstrations, check_memory
 from hindrl_jax.training.experiment import Diverged, fit
+from hindrl_jax.training.progress import ProgressBar
 from hindrl_jax.training.recording import record_demonstrations
 from hindrl_jax.training.result import Result
 

@@ -213,7 +213,7 @@ def _warn_of_what_has_no_effect(before: Any, section: Any, config: TrainConfig |
     config = config or section
     for field in dataclasses.fields(section):
         value, value_before = getattr(section, field.name), getattr(before, field.name)
-        if dataclasses.is_dataclass(value):
+        if dataclasses.is_dataclass(value) and not callable(value):  # a section, not a network of one's own
             _warn_of_what_has_no_effect(value_before, value, config)
         elif value != value_before and (reason := without_effect(config, field.name)):
             warnings.warn(f"{_as_given(field.name, value)} changes nothing: {reason}", stacklevel=2)

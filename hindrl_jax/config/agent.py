@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from collections.abc import Callable
+from typing import Any, Literal
 
 from hindrl_jax.base.checks import check, check_types
 
@@ -57,6 +58,15 @@ class AgentConfig:
     """Clone only the demonstrated actions that the critics value above the policy's own (hard; Nair et al., 2018, eq. 4), or each in proportion to
     the probability that it is better (smooth; SPReD, Zhu et al., 2025), where the critics' values, tqc's the means of their quantiles, are an
     ensemble."""
+    actor_network: Callable[..., Any] | None = None
+    """An actor of your own, MODULE:NAME: called with the number of outputs, twice the action's, returns a flax module, (B, inputs) -> (B, outputs).
+    See `core.networks`."""
+    critic_network: Callable[..., Any] | None = None
+    """Critics of your own, likewise: their inputs are the actor's and the action, their outputs the quantiles, or one value."""
+    actor_loss: Callable[..., Any] | None = None
+    """A loss of the actor of your own, MODULE:NAME: called with `core.losses.ActorTerms` and this config, in place of `core.losses.actor_loss`."""
+    critic_loss: Callable[..., Any] | None = None
+    """A loss of the critics of your own, called with `core.losses.CriticTerms` and this config, in place of `core.losses.critic_loss`."""
     input_encoding: Literal["raw", "multiscale", "standardised"] = "multiscale"
     """Networks see inputs as they are (thesis); or less their mean in the demonstrations, over their standard deviation; or (multiscale) that and
     tanh(4 x), x being the input over its root mean square there."""

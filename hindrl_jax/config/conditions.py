@@ -28,17 +28,23 @@ def _clones(config: TrainConfig) -> bool:
     return not config.learns_from_rollouts or config.agent.bc_weight > 0.0
 
 
+def _has_a_network_of_ours(config: TrainConfig) -> bool:
+    return config.agent.actor_network is None or (config.learns_from_rollouts and config.agent.critic_network is None)
+
+
 CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
     (
         "max_demo_ratio reach_zero relabelled_per_original hindrl_sampling_strategy union_sampling_ratio intersection_goals "
         "n_step gamma bootstrap_past_relabelled_goals timeouts_are_terminal "
         "achieved_goal_ratio clip_targets num_critics num_target_critics num_quantiles top_quantiles_to_drop_per_net "
         "layer_norm target_update_rate initial_alpha relative_value target_entropy final_target_entropy bc_weight agent_resets num_envs "
-        "updates_per_iteration learning_starts buffer_size demo_reset_ratio demo_reset_curriculum",
+        "updates_per_iteration learning_starts buffer_size demo_reset_ratio demo_reset_curriculum critic_network actor_loss critic_loss",
         lambda c: c.learns_from_rollouts,
         "behaviour cloning does not use it: choose another algo",
     ),
     ("num_quantiles top_quantiles_to_drop_per_net", lambda c: c.agent.base == "tqc", "{base} has no quantiles: choose --base tqc"),
+    ("net_arch residual", _has_a_network_of_ours, "networks of your own are as large as they say: drop it"),
+    ("layer_norm", lambda c: c.agent.critic_network is None, "critics of your own have layer normalisation or not: drop it"),
     ("layer_norm", lambda c: not c.agent.residual, "residual networks have layer normalisation of their own: set --no-residual"),
     (
         "hindrl_sampling_strategy union_sampling_ratio intersection_goals",

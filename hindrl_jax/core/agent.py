@@ -17,18 +17,27 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Array, Transition
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.core.comparison import better, probability_of_being_better
 from hindrl_jax.core.inputs import InputScale, network_inputs
 from hindrl_jax.core.kernels import mean_over_blocks, num_blocks
-from hindrl_jax.core.losses import behaviour_cloning, entropy_coefficient, quantile_huber, squared_error, target_atoms, target_value
+from hindrl_jax.core.losses import (
+    ActorTerms,
+    CriticTerms,
+    actor_loss,
+    behaviour_cloning,
+    critic_loss,
+    entropy_coefficient,
+    target_atoms,
+    target_value,
+)
 from hindrl_jax.core.networks import Params, apply_actor, apply_critics, init_actor, init_critics, mean_return, mean_returns
 from hindrl_jax.core.schedules import Schedule
 
 Metrics = dict[str, Array]
 
-_LEAST_VALUE = 0.01  # values below it count as this much where the actor climbs them relative to their size
 _ADAM = optax.scale_by_adam()  # the step size is applied apart, since it may be an array, in sweeps
 
 
@@ -114,10 +123,10 @@ class _Columns(struct.PyTreeNode, kw_only=True):
 def update(key: Array, state: AgentState, batch: Transition, schedule: Schedule, config: TrainConfig) -> tuple[AgentState, Metrics]:
     """One gradient step of critics, actor and entropy coefficient, then one move of the target networks and of the averaged actor.
 
-    Critic: quantile Huber loss towards the truncated atoms of r + discount (Z' - alpha log pi(a' | s')); for algorithms without quantiles the
-      squared error to r + discount (min Q' - alpha log pi(a' | s')). With `relative_value` targets have no entropy term.
-    Actor: mean(alpha log pi - value(s, a_pi)) + bc_weight * behaviour cloning loss; the value is the mean over critics and quantiles (tqc), or the
-      least critic's (sac; with REDQ's subsets the mean over critics). With `relative_value` each row's is
+    Critic (`losses.critic_loss`): quantile Huber loss towards the truncated atoms of r + discount (Z' - alpha log pi(a' | s')); for algorithms
+      without quantiles the squared error to r + discount (min Q' - alpha log pi(a' | s')). With `relative_value` targets have no entropy term.
+    Actor (`losses.actor_loss`): mean(alpha log pi - value(s, a_pi)) + bc_weight * behaviour cloning loss; the value is the mean over critics and
+      quantiles (tqc), or the least critic's (sac; with REDQ's subsets the mean over critics). With `relative_value` each row's is
       divided by max(itself, 0.01), through which no gradient flows: its share of the metric `actor/loss` is then 1, so read `actor/value`.
 
     Args:
@@ -198,11 +207,31 @@ def _critic_gradient(state: AgentState, target_critics: Params, config: TrainCon
 
     def loss(critics: Params) -> tuple[Array, Metrics]:
         quantiles = apply_critics(critics, block.inputs, block.action, config.agent)
-        errors = quantile_huber(quantiles, targets) if config.agent.base == "tqc" else squared_error(quantiles[:, 0], targets[0])
-        value = jnp.mean(errors)
+        terms = CriticTerms(
+            quantiles=quantiles,
+            targets=targets,
+            taken_action=block.action,
+            is_demonstration=block.is_demonstration,
+            critics=lambda action: apply_critics(critics, block.inputs, action, config.agent),
+        )
+        value = _scalar((config.agent.critic_loss or critic_loss)(terms, config.agent), "critic_loss")
         return value, {"critic/loss": value, "critic/value": jnp.mean(quantiles), "critic/target": jnp.mean(targets)}
 
     return jax.grad(loss, has_aux=True)(state.critics)
+
+
+def action_value(critics: Params, inputs: Array, action: Array, config: TrainConfig) -> Array:
+    """The value (B,) of actions (B, A) in [-1, 1] at inputs (B, input_dim): what the actor climbs, the mean over critics and quantiles.
+
+    Without quantiles it is the least critic's, or with REDQ's subsets the mean over critics.
+    """
+    return _value(critics, inputs.T, action.T, config)
+
+
+def _scalar(loss: Array, name: str) -> Array:
+    if jnp.shape(loss) != ():
+        raise UserError(f"{name} gives an array of shape {jnp.shape(loss)}: let it give one number, as jnp.mean does")
+    return loss
 
 
 def _value(critics: Params, inputs: Array, action: Array, config: TrainConfig) -> Array:
@@ -233,10 +262,20 @@ def _actor_gradient(state: AgentState, schedule: Schedule, config: TrainConfig, 
         distribution = apply_actor(actor, block.inputs, agent, action_dim=block.action.shape[0])
         action, log_prob = distribution.at(block.noise)
         values, entropy = _value(state.critics, block.inputs, action, config), -jnp.mean(log_prob)
-        climbed = values / jax.lax.stop_gradient(jnp.maximum(values, _LEAST_VALUE)) if agent.relative_value else values
         weight = _cloning_weight(state.critics, block, distribution.mode, config)
         bc = behaviour_cloning(distribution.mode if quirks.bc_action == "mean" else action, block.action, weight, form=quirks.bc_loss)
-        total = -jnp.exp(state.log_alpha) * entropy - jnp.mean(climbed) + agent.bc_weight * bc
+        terms = ActorTerms(
+            value=values,
+            action=action,
+            log_prob=log_prob,
+            mode=distribution.mode,
+            alpha=jnp.exp(state.log_alpha),
+            cloning=bc,
+            taken_action=block.action,
+            is_demonstration=block.is_demonstration,
+            critics=lambda action: apply_critics(state.critics, block.inputs, action, agent),
+        )
+        total = _scalar((agent.actor_loss or actor_loss)(terms, agent), "actor_loss")
         return total, {"actor/loss": total, "actor/bc_loss": bc, "actor/value": jnp.mean(values), "actor/entropy": entropy}
 
     return jax.grad(loss, has_aux=True)(state.actor)

@@ -1,20 +1,75 @@
 """Losses of TQC (Kuznetsov et al., 2020), of SAC, and of learning from demonstrations, as functions of arrays.
 
 Atoms (quantiles) lie on the leading axes and the batch on the last. How truncation and the quantile loss are computed fast is in `kernels`.
+
+`actor_loss` and `critic_loss` are where the losses are put together. One of your own, `actor_loss` or `critic_loss` of the config, is a function of
+the same terms and takes its place:
+
+    def calm(terms, config):
+        return losses.actor_loss(terms, config) + 0.1 * jnp.mean(jnp.square(terms.mode))
+
+    agent = dataclasses.replace(config.agent, actor_loss=calm)
+
+On a CPU, batches with wide layers are cut into blocks, whose losses are averaged: let yours be a mean over rows.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 
 from hindrl_jax.base.types import Array
+from hindrl_jax.config import AgentConfig
 from hindrl_jax.core import kernels
 
 _LEAST_SQUARED_LENGTH = 1e-3  # of actions; demonstrations that hardly do anything are not blown up
 _LEAST_WEIGHT = 1e-6  # of a batch, whose weights may all be 0
+_LEAST_VALUE = 0.01  # values below it count as this much where the actor climbs them relative to their size
+
+
+class ActorTerms(struct.PyTreeNode, kw_only=True):
+    """What a loss of the actor may be made of. Gradients flow through what the actor does: `value`, `action`, `log_prob`, `mode`, `cloning`."""
+
+    value: Array  # (B,) of the sampled action, by the critics
+    action: Array  # (A, B) sampled, in (-1, 1)
+    log_prob: Array  # (B,) of the sampled action
+    mode: Array  # (A, B) the mean action, tanh(mean)
+    alpha: Array  # () entropy coefficient
+    cloning: Array  # () behaviour cloning loss, see `behaviour_cloning`
+    taken_action: Array  # (A, B) of the batch: what was done
+    is_demonstration: Array  # (B,) bool
+    critics: Callable[[Array], Array] = struct.field(pytree_node=False)  # actions (A, B) -> quantiles (C, Q, B); Q is 1 where there are none
+
+
+class CriticTerms(struct.PyTreeNode, kw_only=True):
+    """What a loss of the critics may be made of. Gradients flow through `quantiles` and `critics`."""
+
+    quantiles: Array  # (C, Q, B) of the actions that were taken; Q is 1 where there are no quantiles
+    targets: Array  # (M, B) atoms of the Bellman target, no gradient
+    taken_action: Array  # (A, B) of the batch
+    is_demonstration: Array  # (B,) bool
+    critics: Callable[[Array], Array] = struct.field(pytree_node=False)  # other actions (A, B) -> (C, Q, B), for penalties on them
+
+
+def actor_loss(terms: ActorTerms, config: AgentConfig) -> Array:
+    """mean(alpha log pi - value) + bc_weight * cloning: ().
+
+    With `relative_value` each row's value is divided by max(itself, 0.01), through which no gradient flows.
+    """
+    entropy = -jnp.mean(terms.log_prob)
+    climbed = terms.value / jax.lax.stop_gradient(jnp.maximum(terms.value, _LEAST_VALUE)) if config.relative_value else terms.value
+    return -terms.alpha * entropy - jnp.mean(climbed) + config.bc_weight * terms.cloning
+
+
+def critic_loss(terms: CriticTerms, config: AgentConfig) -> Array:
+    """The mean quantile Huber loss, or the mean squared error where there are no quantiles: ()."""
+    if config.base == "tqc":
+        return jnp.mean(quantile_huber(terms.quantiles, terms.targets))
+    return jnp.mean(squared_error(terms.quantiles[:, 0], terms.targets[0]))
 
 
 def quantile_huber(quantiles: Array, targets: Array) -> Array:

@@ -2,10 +2,25 @@
 
 Features lie on the leading axis and the batch on the last, here as in `losses`: kernels are small, batches long, and on a CPU the products and
 the gradients of kernels and biases are fastest along contiguous batches.
+
+A network of your own, `actor_network` or `critic_network` of the config, is an ordinary flax module with the batch first. It is called with the
+number of its outputs, and made in one place, `_network`:
+
+    class Tanh(nn.Module):
+        out_dim: int
+
+        @nn.compact
+        def __call__(self, features):  # (B, inputs) -> (B, out_dim)
+            return nn.Dense(self.out_dim)(nn.tanh(nn.Dense(64)(features)))
+
+    agent = dataclasses.replace(config.agent, actor_network=Tanh)
+
+Its parameters are dictionaries of arrays, and it keeps no other variables: no batch normalisation, no dropout.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -13,6 +28,7 @@ import jax.numpy as jnp
 from flax import linen as nn
 from flax import struct
 
+from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Array
 from hindrl_jax.config import RESIDUAL_EXPANSION, AgentConfig
 
@@ -98,15 +114,36 @@ class ActionDistribution(struct.PyTreeNode, kw_only=True):
         return jnp.tanh(pre_tanh), jnp.sum(log_prob - log_slope, axis=0)
 
 
-def _actor(config: AgentConfig, action_dim: int) -> nn.Module:
-    return _network(config, 2 * action_dim, layer_norm=False)
+class _BatchFirst:
+    """A module (B, in) -> (B, out) as one (in, B) -> (out, B)."""
+
+    def __init__(self, module: Any, out_dim: int):
+        self._module, self._out_dim = module, out_dim
+
+    def init(self, key: Array, features: Array) -> Params:
+        return self._module.init(key, features.T)
+
+    def apply(self, params: Params, features: Array) -> Array:
+        output = self._module.apply(params, features.T)
+        wanted = (features.shape[1], self._out_dim)
+        if jnp.shape(output) != wanted:
+            name = type(self._module).__name__
+            raise UserError(f"{name} gives {jnp.shape(output)} for inputs of shape {features.T.shape}: let it give (B, out_dim) = {wanted}")
+        return output.T
 
 
-def _critic(config: AgentConfig, out_dim: int) -> nn.Module:
-    return _network(config, out_dim, layer_norm=config.layer_norm)
+def _actor(config: AgentConfig, action_dim: int) -> Any:
+    return _network(config, config.actor_network, 2 * action_dim, layer_norm=False)
 
 
-def _network(config: AgentConfig, out_dim: int, *, layer_norm: bool) -> nn.Module:
+def _critic(config: AgentConfig, out_dim: int) -> Any:
+    return _network(config, config.critic_network, out_dim, layer_norm=config.layer_norm)
+
+
+def _network(config: AgentConfig, own: Callable[[int], Any] | None, out_dim: int, *, layer_norm: bool) -> Any:
+    """The one place in which networks are made: what has `init` and `apply`, with features first."""
+    if own is not None:
+        return _BatchFirst(own(out_dim), out_dim)
     if config.residual:
         return ResidualMLP(net_arch=config.net_arch, out_dim=out_dim)
     return MLP(net_arch=config.net_arch, out_dim=out_dim, layer_norm=layer_norm)
@@ -125,7 +162,7 @@ def init_critics(key: Array, config: AgentConfig, *, input_dim: int, action_dim:
 
 def apply_actor(params: Params, inputs: Array, config: AgentConfig, *, action_dim: int) -> ActionDistribution:
     """The policy at inputs (input_dim, B); the logarithm of the deviation is clamped to [-20, 2]."""
-    output: Any = _actor(config, action_dim).apply(params, inputs)
+    output = _actor(config, action_dim).apply(params, inputs)
     mean, log_std = jnp.split(output, 2, axis=0)
     return ActionDistribution(mean=mean, log_std=jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX))
 
@@ -133,7 +170,7 @@ def apply_actor(params: Params, inputs: Array, config: AgentConfig, *, action_di
 def _apply_each(params: Params, inputs: Array, action: Array, config: AgentConfig, out_dim: int) -> Array:
     # One critic after the other: as one batched product they are slower on a CPU.
     joint = jnp.concatenate([inputs, action], axis=0)
-    critic: Any = _critic(config, out_dim)
+    critic = _critic(config, out_dim)
     num_critics = jax.tree.leaves(params)[0].shape[0]
     members = [jax.tree.map(lambda leaf, n=n: leaf[n], params) for n in range(num_critics)]
     return jnp.stack([critic.apply(member, joint) for member in members])
@@ -154,6 +191,8 @@ def mean_return(params: Params, inputs: Array, action: Array, config: AgentConfi
 
 def mean_returns(params: Params, inputs: Array, action: Array, config: AgentConfig) -> Array:
     """Mean over the quantiles of `apply_critics`, (C, B), in less work: the last layer is linear, so its kernel is averaged instead."""
+    if config.critic_network is not None:  # whose last layer nobody knows
+        return jnp.mean(apply_critics(params, inputs, action, config), axis=1)
     num_hidden = 2 * len(config.net_arch) + 1 if config.residual else len(config.net_arch)
     last = f"Dense_{num_hidden}"
     output = jax.tree.map(lambda leaf: jnp.mean(leaf, axis=-1, keepdims=True), params["params"][last])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import os
 import shlex
 from collections.abc import Callable, Sequence
@@ -17,14 +18,18 @@ from flax.traverse_util import unflatten_dict
 from hindrl_jax.base.compilation import in_float32
 from hindrl_jax.base.environments import Environment, Restorable
 from hindrl_jax.base.errors import UserError, one_line
-from hindrl_jax.base.files import DAMAGED_ARCHIVE, disk_trouble, read_arrays
+from hindrl_jax.base.files import DAMAGED_ARCHIVE, disk_trouble, read_arrays, write_atomically
 from hindrl_jax.base.steppers import Watchable
 from hindrl_jax.base.types import Episodes
-from hindrl_jax.core.agent import Policy, init, policy
+from hindrl_jax.core.agent import Params, Policy, init, policy
 from hindrl_jax.core.goals import GoalTable
 from hindrl_jax.core.holding import hold
 from hindrl_jax.core.inputs import InputScale
 from hindrl_jax.plotting.films import check_film, save_film, save_pictures
+from hindrl_jax.runs import numpy_policy
+from hindrl_jax.runs.acting import TrainedPolicy, TrainedValue, numpy_form
+from hindrl_jax.runs.numpy_policy import NumpyPolicy
+from hindrl_jax.runs.numpy_policy import save as save_numpy_policy
 from hindrl_jax.runs.shipped import run_directory
 from hindrl_jax.runs.spec import CONFIG, PARAMETERS, RunSpec, read_spec
 from hindrl_jax.tasks.registry import checked
@@ -41,6 +46,74 @@ class Run:
     """Leaves (S, ...)."""
     behavioural_goals: GoalTable
     """Leaves (S, ...)."""
+    critics: Params | None = None
+    """Leaves (S, C, ...), as they are at the end of the run; None for behaviour cloning, which has none."""
+
+    def policy(self, seed: int | None = None) -> TrainedPolicy:
+        """One seed's policy as a function, observation and goal -> action, in the task's own units; compiled.
+
+            policy = run.policy()
+            action = policy(observation, goal)  # (D,), (G,) -> (A,); or with leading axes
+
+        Where no goal is given, it is the run's first behavioural goal; where each episode has a goal of its own, one has to be given. It is the mean
+        action, or with a key one with the noise that the run has found to be best. Each action is to be held for `policy.action_hold` control steps.
+
+        Args:
+          seed: one of the run's seeds; the first by default.
+
+        Raises:
+          UserError: if the run has no such seed.
+        """
+        index, (env, config) = self._index_of(seed), (self.spec.env, self.spec.config)
+        policy, goals = jax.tree.map(lambda leaf: leaf[index], (self.policies, self.behavioural_goals))
+        own_goals = getattr(env, "gives_goals", False) or config.goal.behavioural_goals == "environment"
+        return TrainedPolicy(env, config, policy, None if own_goals else goals.goals[0])
+
+    def value(self, seed: int | None = None) -> TrainedValue:
+        """One seed's critics as a function, observation and goal -> expected return of the policy's action, or of another one; compiled.
+
+        The critics are those at the end of the run, and the policy is the best that it has seen: read the run with `last` for those of one time.
+
+        Args:
+          seed: one of the run's seeds; the first by default.
+
+        Raises:
+          UserError: if the run has no such seed, or no critics.
+        """
+        trained, index = self.policy(seed), self._index_of(seed)
+        if self.critics is None:
+            raise UserError(f"{self.path} holds no critics, since {self.spec.config.algo} trains none: choose a run of another algo")
+        return TrainedValue(trained, jax.tree.map(lambda leaf: leaf[index], self.critics))
+
+    def numpy_policy(self, seed: int | None = None) -> NumpyPolicy:
+        """As `policy`, in NumPy alone: the same function to float32's rounding, which needs no JAX.
+
+        Raises:
+          UserError: if the run has no such seed, or its policies have no form in NumPy.
+        """
+        return NumpyPolicy(*numpy_form(self.policy(seed)))
+
+    def export_policy(self, folder: str | os.PathLike[str], seed: int | None = None, *, overwrite: bool = False) -> Path:
+        """Writes one seed's policy for a computer without JAX: policy.npz, and numpy_policy.py, which plays it with NumPy alone.
+
+        Args:
+          folder: where; made if it is not there.
+          seed: one of the run's seeds; the first by default.
+          overwrite: replace files of these names.
+
+        Returns:
+          The path of policy.npz.
+
+        Raises:
+          UserError: as `numpy_policy`, or if the files are there or cannot be written.
+        """
+        content = io.BytesIO()
+        save_numpy_policy(content, *numpy_form(self.policy(seed)))
+        path = Path(folder) / "policy.npz"
+        code = Path(numpy_policy.__file__)
+        write_atomically(path, content.getvalue(), overwrite=overwrite)
+        write_atomically(path.with_name(code.name), code.read_bytes(), overwrite=overwrite)
+        return path
 
     def in_backend(self, backend: str) -> Run:
         """The same policies, with the task simulated by another back end.
@@ -184,21 +257,24 @@ def load_run(path: str | os.PathLike[str], *, last: bool = False) -> Run:
         policies = Policy(actor=actor, scale=_input_scale(tree["input_scale"]), noise=noise)
     except (*DAMAGED_ARCHIVE, AttributeError, IndexError) as error:
         raise UserError(f"{file} is damaged ({one_line(error)}): train again") from error
-    _check_parameters(file, spec, (policies, goals))
-    return Run(path=path, spec=spec, policies=policies, behavioural_goals=goals)
+    critics = tree.get("critics") if spec.config.learns_from_rollouts else None
+    _check_parameters(file, spec, (policies, goals, critics))
+    return Run(path=path, spec=spec, policies=policies, behavioural_goals=goals, critics=critics)
 
 
 class _Shape(tuple[int | None, ...]):
     """A shape as a leaf of a tree; None where any number will do."""
 
 
-def _check_parameters(file: Path, spec: RunSpec, found: tuple[Policy, GoalTable]) -> None:
+def _check_parameters(file: Path, spec: RunSpec, found: tuple[Policy, GoalTable, Params | None]) -> None:
     """Makes sure that the parameters are those of the configuration, and numbers.
 
     Raises:
       UserError: naming the first array that is not.
     """
-    expected = jax.tree_util.tree_leaves_with_path(_shapes_of(spec), is_leaf=lambda leaf: type(leaf) is _Shape)
+    policies, goals, critics = _shapes_of(spec)
+    shapes = (policies, goals, None if found[2] is None else critics)
+    expected = jax.tree_util.tree_leaves_with_path(shapes, is_leaf=lambda leaf: type(leaf) is _Shape)
     arrays = {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(found)}
     for path, shape in expected:
         name = jax.tree_util.keystr(path)
@@ -220,19 +296,20 @@ def _check_parameters(file: Path, spec: RunSpec, found: tuple[Policy, GoalTable]
         raise UserError(f"{file} is damaged (it counts {count.tolist()} of {num_goals} behavioural goals): train again")
 
 
-def _shapes_of(spec: RunSpec) -> tuple[Policy, GoalTable]:
-    """The shapes of a run's policies and behavioural goals, leaves tuples (S, ...); None where any number will do."""
+def _shapes_of(spec: RunSpec) -> tuple[Policy, GoalTable, Params]:
+    """The shapes of a run's policies, behavioural goals and critics, leaves tuples (S, ...); None where any number will do."""
     num_seeds, env = len(spec.seeds), hold(spec.env, spec.config.num_held, chunks=spec.config.action_chunks)
     dims = dict(observation=env.observation_dim, goal=env.goal_dim, observation_centre=env.observation_dim, goal_centre=env.goal_dim)
     vectors: dict[str, Any] = {name: jax.ShapeDtypeStruct((dim,), jnp.float32) for name, dim in dims.items()}
 
-    def fresh(key: jax.Array, scale: InputScale) -> Policy:
-        return policy(init(key, scale, spec.config, action_dim=env.action_dim), average=True)
+    def fresh(key: jax.Array, scale: InputScale) -> tuple[Policy, Params]:
+        agent = init(key, scale, spec.config, action_dim=env.action_dim)
+        return policy(agent, average=True), agent.critics
 
     of_one = jax.eval_shape(fresh, jax.random.key(0), InputScale(**vectors))
-    policies = jax.tree.map(lambda leaf: _Shape((num_seeds, *leaf.shape)), of_one)
+    policies, critics = jax.tree.map(lambda leaf: _Shape((num_seeds, *leaf.shape)), of_one)
     table: dict[str, Any] = dict(goals=_Shape((num_seeds, None, env.goal_dim)), count=_Shape((num_seeds,)))
-    return policies, GoalTable(**table)
+    return policies, GoalTable(**table), critics
 
 
 def _input_scale(saved: dict[str, jax.Array]) -> InputScale:

@@ -22,6 +22,7 @@ from typing import Any, get_args, get_type_hints
 from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.config import TrainConfig
+from hindrl_jax.tasks.functions import find_function, function_name, is_function
 from hindrl_jax.tasks.registry import did_you_mean, full_name, make
 from hindrl_jax.training.result import Row
 
@@ -51,7 +52,7 @@ class RunSpec:
             "env_args": dataclasses.asdict(self.env),
             "demos": self.demos,
             "seeds": list(self.seeds),
-            "config": dataclasses.asdict(self.config),
+            "config": _with_names(dataclasses.asdict(self.config)),
         }
 
     @staticmethod
@@ -109,12 +110,20 @@ def _config_from_dict(config_class: type[Any], data: Any, name: str, where: Path
     for field, value in data.items():
         if dataclasses.is_dataclass(hints[field]):
             values[field] = _config_from_dict(hints[field], value, field, where)
+        elif is_function(hints[field]) and isinstance(value, str):
+            values[field] = find_function(value)
         else:
             values[field] = _tuples(value) if get_args(hints[field]) else value
     try:
         return config_class(**values)
     except ValueError as error:
         raise UserError(f"{where}: {error}") from error
+
+
+def _with_names(values: dict[str, Any]) -> dict[str, Any]:
+    """The fields of a config and its sections, with names in place of functions."""
+    plain = {name: _with_names(value) if isinstance(value, dict) else value for name, value in values.items()}
+    return {name: function_name(value) if callable(value) else value for name, value in plain.items()}
 
 
 def _tuples(value: Any) -> Any:

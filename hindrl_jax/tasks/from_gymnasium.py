@@ -140,6 +140,11 @@ class GymnasiumEnv:
         return played_actions(action, self.action_low + half, self.action_high - half, whole=whole).astype(np.float32)
 
     @property
+    def whole_actions(self) -> bool:
+        """Whether it takes whole numbers, see `played_action`."""
+        return bool(self.description.whole_actions)
+
+    @property
     def render_fps(self) -> int:
         return self.description.render_fps
 

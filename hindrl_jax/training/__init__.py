@@ -1,8 +1,9 @@
-"""Training, recording and playing in memory: many seeds in one program, spread over devices; no disk and no printing.
+"""Training, recording and playing in memory: many seeds in one program, spread over devices; no disk, and on the screen progress alone.
 
 Environments are asked what they can do (`hindrl_jax.base`), never of what kind they are.
 
     experiment      fit: the loop between the programs, with evaluations
+    progress        the bar that a person sees
     result          what it leaves: Result, Row, SeedSummary
     selection       the policies that are kept along a run, and which of them is returned
     checks          what is refused, in a line that names the ability that is missing

@@ -1,4 +1,4 @@
-"""Running an experiment: demonstrations, many seeds in one program, evaluations along the way. Touches no disk and prints nothing."""
+"""Running an experiment: demonstrations, many seeds in one program, evaluations along the way. Touches no disk."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from hindrl_jax.training.checks import check_config, check_memory, check_seeds, 
 from hindrl_jax.training.devices import gather, spread
 from hindrl_jax.training.host import HostPrograms
 from hindrl_jax.training.programs import FRESH_EPISODES, JaxPrograms, Programs
+from hindrl_jax.training.progress import ProgressBar
 from hindrl_jax.training.result import SAMPLED_SUCCESS, Result, Row
 from hindrl_jax.training.selection import Trial, better, choose, keep, nothing_kept
 
@@ -39,7 +40,7 @@ def fit(
     config: TrainConfig | Sequence[TrainConfig],
     *,
     seeds: Sequence[int] = (0,),
-    report: Report = lambda result: None,
+    report: Report | None = None,
     restore: Callable[[Result], Result | None] = lambda begun: None,
 ) -> Result:
     """Trains one policy per seed, all of them side by side in one compiled program.
@@ -57,7 +58,8 @@ def fit(
         chosen by the demonstrations of all of them, and with `stop_at` they all learn on until the last of them is done.
       report: called after compilation, several times between evaluations, after each evaluation, and at the end. Where it returns True
         while the experiment learns, that ends: what was found so far is returned as usual. Where it has a method `wait`, as `ProgressBar` does,
-        that is called with "compiling" before this begins, since it takes 10 s to minutes.
+        that is called with "compiling" before this begins, since it takes 10 s to minutes. None shows a `ProgressBar` where a person watches, in a
+        terminal or a notebook, and nothing elsewhere; `lambda result: None` shows nothing anywhere.
       restore: called before anything is computed with a result whose guidance, state and key are `jax.ShapeDtypeStruct`s. Where it returns
         what `report` was given at some time in an earlier call with the same arguments, the experiment goes on from there, and all that
         follows is the same, bit for bit; see `hindrl_jax.runs.checkpoints`. Where it returns None, the experiment begins. In environments that
@@ -72,6 +74,9 @@ def fit(
         memory.
       Diverged: if a loss or a value is not a finite number.
     """
+    if report is None:
+        with ProgressBar() as progress:
+            return fit(env, demonstrations, config, seeds=seeds, report=progress if progress.is_watched else _no_report, restore=restore)
     keep_compiled_programs()
     check_trainable(env)
     check_seeds(seeds)
@@ -104,6 +109,10 @@ def fit(
         _train(result, programs, report)
     report(result)
     return result
+
+
+def _no_report(result: Result) -> None:
+    """Nobody is told."""
 
 
 def programs_of(env: Environment, configs: Sequence[TrainConfig], demonstrations: Episodes) -> Programs:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import linen as nn
 from traced_programs import DEMONSTRATIONS, ENV, Program
 
 from hindrl_jax.base.types import Transition
@@ -38,6 +39,16 @@ def keys_are_not_followed():
     """That takes longer than tracing; other tests do it."""
     with jax.debug_key_reuse(False):
         yield
+
+
+class Tanh(nn.Module):
+    """A network of one's own."""
+
+    out_dim: int
+
+    @nn.compact
+    def __call__(self, features):
+        return nn.Dense(self.out_dim)(jnp.tanh(nn.Dense(3)(features)))
 
 
 # Not a part of the program: what the host reads, to choose the program and to count.
@@ -95,6 +106,10 @@ VALUES = {
     "final_target_entropy": (-4.0, -5.0),
     "bc_weight": (0.1, 0.2),
     "q_filter": ("hard", "smooth"),
+    "actor_network": (Tanh,),
+    "critic_network": (Tanh,),
+    "actor_loss": (lambda terms, config: jnp.mean(jnp.square(terms.mode)),),
+    "critic_loss": (lambda terms, config: jnp.mean(jnp.square(terms.quantiles)),),
     "input_encoding": ("raw", "multiscale"),
     "strict_goal_test": (True, False),
     "bootstrap_past_relabelled_goals": (True, False),
@@ -168,6 +183,7 @@ BASES = {
         "no demonstration rows": dict(max_demo_ratio=0.0),
         "no demonstration rows, a warm start": dict(max_demo_ratio=0.0, bc_warm_start=1),
         "no demonstration rows, proposals of a clone": dict(max_demo_ratio=0.0, imitation_proposal=1),
+        "networks of one's own": dict(actor_network=Tanh, critic_network=Tanh),
         "no cloning": dict(bc_weight=0.0, agent_resets=(0.4,)),
     }.items()
 }

@@ -106,6 +106,7 @@ BAD = [
     (AgentConfig, "target_entropy", [float("nan"), "auto"]),
     (AgentConfig, "final_target_entropy", [float("nan")]),
     (AgentConfig, "bc_weight", [-1.0]),
+    *((AgentConfig, f"{of}_{what}", ["module:Name", 3]) for of in ("actor", "critic") for what in ("network", "loss")),
     (AgentConfig, "input_encoding", ["scaled", "standardized"]),
     (QuirksConfig, "strict_goal_test", [1, "yes"]),
     (QuirksConfig, "bootstrap_past_relabelled_goals", [0]),

@@ -2,6 +2,7 @@
 
 import itertools
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +13,7 @@ from probe import (
     SCHEDULE,
     B,
     fresh_agent,
+    inputs_of,
     last,
     make_batch,
     mean_action,
@@ -22,8 +24,10 @@ from probe import (
     with_constant_critics,
 )
 
+from hindrl_jax.base.errors import UserError
 from hindrl_jax.config import AgentConfig
 from hindrl_jax.core import agent as agents
+from hindrl_jax.core import losses
 from hindrl_jax.core.networks import apply_actor
 
 BASES = {"tqc": CONFIG, "sac": with_agent(base="sac")}
@@ -220,3 +224,55 @@ def test_with_subsets_sac_climbs_the_mean_of_all_critics():
     start = with_constant_critics(fresh_agent(jax.random.key(0), config), (0.0, 1.0, 5.0), target=False)
     metrics = one_update(jax.random.key(0), start, make_batch(action=ACTIONS, reward=0.0, discount=0.0), config)[1]
     np.testing.assert_allclose(metrics["actor/value"], 2.0, atol=0.15)
+
+
+OWN_BATCH = make_batch(action=ACTIONS, reward=ACTIONS[:, 0], discount=0.5, is_demonstration=np.arange(B) < 8)
+
+
+def test_losses_of_ones_own_take_the_place_of_the_built_in_ones():
+    config = with_agent(bc_weight=0.3, num_critics=2)
+    start = fresh_agent(jax.random.key(0), config)
+    expected, _ = one_update(jax.random.key(1), start, OWN_BATCH, config)
+    same = with_agent(config, actor_loss=lambda *given: losses.actor_loss(*given), critic_loss=lambda *given: losses.critic_loss(*given))
+    chex.assert_trees_all_equal(one_update(jax.random.key(1), start, OWN_BATCH, same)[0], expected)
+
+    # Where nothing has a gradient, nothing moves; the other one is as it was.
+    for name, frozen in (("actor", with_agent(config, actor_loss=lambda terms, _: terms.alpha)), ("critics", None)):
+        frozen = frozen or with_agent(config, critic_loss=lambda terms, _: jnp.mean(terms.targets))
+        moved, metrics = one_update(jax.random.key(1), start, OWN_BATCH, frozen)
+        chex.assert_trees_all_equal(getattr(moved, name), getattr(start, name))
+        value = metrics["actor/loss"] - metrics["alpha/value"] if name == "actor" else metrics["critic/loss"] - metrics["critic/target"]
+        assert float(value) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_terms_of_losses_are_those_of_the_batch():
+    def actor(terms, config):
+        assert terms.value.shape == terms.log_prob.shape == terms.is_demonstration.shape == (B,)
+        assert terms.action.shape == terms.mode.shape == terms.taken_action.shape == (1, B)
+        assert terms.critics(terms.mode).shape == (2, config.num_quantiles, B)
+        return jnp.mean(jnp.where(terms.is_demonstration[None], jnp.square(terms.mode - terms.taken_action), 0.0))
+
+    def critics(terms, config):
+        assert terms.quantiles.shape == (2, config.num_quantiles, B)
+        return jnp.mean(jnp.square(terms.quantiles - terms.critics(terms.taken_action))) + jnp.mean(terms.critics(-terms.taken_action))
+
+    config = with_agent(num_critics=2, actor_loss=actor, critic_loss=critics)
+    start = fresh_agent(jax.random.key(0), config)
+    for key in range(3):
+        start, metrics = one_update(jax.random.key(key), start, OWN_BATCH, config)
+    clone = behaviour_cloning_of(start, config)
+    assert float(metrics["actor/loss"]) != 0.0
+    assert clone < behaviour_cloning_of(fresh_agent(jax.random.key(0), config), config)
+
+
+def behaviour_cloning_of(state, config):
+    """Mean squared distance of the actor's mean action to those of the demonstrations."""
+    inputs = inputs_of(OWN_BATCH.observation, config).T
+    mode = apply_actor(state.actor, inputs, config.agent, action_dim=1).mode
+    return float(jnp.mean(jnp.square(mode - OWN_BATCH.action.T)[:, :8]))
+
+
+def test_a_loss_of_ones_own_that_is_no_number_is_named():
+    config = with_agent(actor_loss=lambda terms, _: terms.value)
+    with pytest.raises(UserError, match=r"actor_loss gives an array of shape \(32,\): let it give one number, as jnp.mean does"):
+        one_update(jax.random.key(0), fresh_agent(jax.random.key(0), config), OWN_BATCH, config)

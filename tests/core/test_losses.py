@@ -5,7 +5,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hindrl_jax.core.losses import behaviour_cloning, entropy_coefficient, quantile_huber, squared_error, target_atoms, target_value
+from hindrl_jax.config import AgentConfig
+from hindrl_jax.core.losses import (
+    ActorTerms,
+    actor_loss,
+    behaviour_cloning,
+    entropy_coefficient,
+    quantile_huber,
+    squared_error,
+    target_atoms,
+    target_value,
+)
 
 
 @pytest.mark.parametrize(
@@ -130,3 +140,22 @@ def test_gradient_of_the_entropy_coefficient(log_prob, expected):
     np.testing.assert_allclose(value, 3.0 * expected, rtol=1e-6)
     policy_gradient = jax.grad(lambda x: entropy_coefficient(jnp.asarray(3.0), x, target_entropy=-2.0))(jnp.array(log_prob))
     assert np.all(np.asarray(policy_gradient) == 0.0)
+
+
+@pytest.mark.parametrize(
+    ("relative", "expected"),
+    [
+        (False, 0.2 - 0.2505 + 0.1),  # alpha times the mean of 1 and 3, less the mean of 0.5 and 0.001, and 0.05 * 2
+        (True, 0.2 - 0.55 + 0.1),  # 0.5 / 0.5 = 1, and 0.001 / 0.01 = 0.1
+    ],
+)
+def test_loss_of_the_actor(relative, expected):
+    action = jnp.zeros((1, 2))
+    terms = ActorTerms(
+        value=jnp.array([0.5, 0.001]),
+        log_prob=jnp.array([1.0, 3.0]),
+        alpha=jnp.asarray(0.1),
+        cloning=jnp.asarray(2.0),
+        **dict(action=action, mode=action, taken_action=action, is_demonstration=jnp.ones(2, bool), critics=None),
+    )
+    assert float(actor_loss(terms, AgentConfig(bc_weight=0.05, relative_value=relative))) == pytest.approx(expected, abs=1e-6)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from flax import linen as nn
 
+from hindrl_jax.base.errors import UserError
 from hindrl_jax.config import AgentConfig
 from hindrl_jax.core.networks import (
     LOG_STD_MAX,
@@ -212,3 +213,37 @@ def test_extreme_distributions_are_finite_and_have_finite_gradients():
     gradient, (action, log_prob) = jax.jit(jax.grad(total, argnums=(0, 1), has_aux=True))(mean, log_std)
     chex.assert_tree_all_finite((gradient, action, log_prob))
     assert np.abs(action).max() <= 1.0
+
+
+class Own(nn.Module):
+    """The built-in network without layer normalisation, written as flax modules are: with the batch first."""
+
+    out_dim: int
+
+    @nn.compact
+    def __call__(self, inputs):
+        for width in CONFIG.net_arch:
+            inputs = nn.relu(nn.Dense(width)(inputs))
+        return nn.Dense(self.out_dim)(inputs)
+
+
+def test_networks_of_ones_own_are_ordinary_modules():
+    """Given the parameters of the built-in ones, which have the same names, they compute the same."""
+    theirs = dataclasses.replace(CONFIG, layer_norm=False)
+    own = dataclasses.replace(theirs, actor_network=Own, critic_network=Own)
+    dims = dict(input_dim=INPUT_DIM, action_dim=ACTION_DIM)
+    actor, critics = (init(jax.random.key(0), own, **dims) for init in (init_actor, init_critics))
+    chex.assert_trees_all_equal_shapes(actor, init_actor(jax.random.key(0), theirs, **dims))
+    chex.assert_trees_all_equal_shapes(critics, init_critics(jax.random.key(0), theirs, **dims))
+    modes = [apply_actor(actor, INPUTS, config, action_dim=ACTION_DIM).mode for config in (own, theirs)]
+    np.testing.assert_allclose(*modes, atol=1e-5)
+    action = jnp.ones((ACTION_DIM, B))
+    for function in (apply_critics, mean_returns, mean_return):
+        np.testing.assert_allclose(function(critics, INPUTS, action, own), function(critics, INPUTS, action, theirs), atol=1e-5)
+
+
+def test_a_network_of_ones_own_that_gives_another_shape_is_named():
+    own = dataclasses.replace(CONFIG, actor_network=lambda out_dim: Own(out_dim + 1))
+    params = init_actor(jax.random.key(0), own, input_dim=INPUT_DIM, action_dim=ACTION_DIM)
+    with pytest.raises(UserError, match=r"Own gives \(4, 5\) for inputs of shape \(4, 3\): let it give \(B, out_dim\) = \(4, 4\)"):
+        apply_actor(params, INPUTS, own, action_dim=ACTION_DIM)

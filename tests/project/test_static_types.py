@@ -27,7 +27,8 @@ def test_mypy_knows_what_the_package_shows(tmp_path):
     """The functions with their parameters; and a name that does not exist."""
     lines = [f"reveal_type(hindrl.{name})" for name in hindrl.__all__]
     code = tmp_path / "own_project.py"
-    code.write_text("\n".join(["import hindrl_jax as hindrl", *lines, 'hindrl.fit("FixedGridPickAndPlace", [])', "hindrl.fitt"]))
+    wrong = ['hindrl.fit("FixedGridPickAndPlace", [])', "hindrl.fitt", "run = hindrl.load_run('runs/mine')", "run.policy(1).action_holds"]
+    code.write_text("\n".join(["import hindrl_jax as hindrl", *lines, *wrong, "run.value().critic", "run.numpy_policy()([0.0]).shapes"]))
     said = mypy(str(code)).stdout
     revealed = dict(zip(hindrl.__all__, [line for line in said.splitlines() if "Revealed type is" in line], strict=True))
     assert [name for name, line in revealed.items() if 'is "Any"' in line] == []
@@ -36,6 +37,8 @@ def test_mypy_knows_what_the_package_shows(tmp_path):
     assert "-> hindrl_jax.training.result.Result" in revealed["fit"]
     assert 'Missing positional argument "config" in call to "fit"' in said
     assert 'Module has no attribute "fitt"' in said
+    for kind, name in (("TrainedPolicy", "action_holds"), ("TrainedValue", "critic"), ("ndarray[tuple[Any, ...], dtype[Any]]", "shapes")):
+        assert f'"{kind}" has no attribute "{name}"' in said
 
 
 def test_names_are_loaded_from_where_type_checkers_see_them():

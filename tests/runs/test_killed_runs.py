@@ -13,7 +13,7 @@ import pytest
 
 import hindrl_jax as hindrl
 from hindrl_jax import cli
-from hindrl_jax.reporting.progress import ProgressBar
+from hindrl_jax.training.progress import ProgressBar
 
 pytestmark = [
     pytest.mark.usefixtures("compile_once", "unfinished_tasks_end_with_their_test"),

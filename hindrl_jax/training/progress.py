@@ -17,7 +17,7 @@ _WIDTHS = (10, 30)  # the least and the most characters of the bar
 
 
 class ProgressBar:
-    """A `report` of `fit`: `hindrl.fit(env, demonstrations, config, report=hindrl.ProgressBar())`.
+    """What `fit` shows where a person watches and no other `report` is given; `report=hindrl.ProgressBar()` shows it in log files, too.
 
     A line stays for the evaluation at each tenth of the run, and for the one that ended it; below them a bar moves, in a terminal or a notebook. A
     log file gets the lines alone, without control characters. Nothing runs beside the training, so nothing is left behind when it is interrupted.
@@ -39,6 +39,11 @@ class ProgressBar:
         self._rows_seen: int | None = None
         self._lines_said = 0
         self._last_is_said = True  # whether the newest evaluation has a line
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether a person is likely to see it: it goes to a terminal or a notebook."""
+        return self._live or self._console.is_jupyter
 
     def __call__(self, result: Result) -> None:
         """Brings everything up to date."""

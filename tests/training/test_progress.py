@@ -13,7 +13,7 @@ from rich.console import Console
 import hindrl_jax as hindrl
 from hindrl_jax.cli import training
 from hindrl_jax.config import TrainConfig
-from hindrl_jax.reporting.progress import bar, evaluation_line
+from hindrl_jax.training.progress import bar, evaluation_line
 from hindrl_jax.training.result import Row
 
 CONFIG = TrainConfig(steps=4_000)
@@ -151,6 +151,26 @@ def test_what_shows_a_training_is_told_that_it_is_being_compiled(monkeypatch):
     assert screen.file.getvalue() == "compiling ...\n"
     with pytest.raises(Compiling):
         hindrl.fit(tiny.ENV, demonstrations, tiny.CONFIG, report=print)
+
+
+@pytest.mark.parametrize(
+    ("options", "written"),
+    [
+        ({"force_terminal": True, "_environ": {"TERM": "xterm"}}, f"compiling ...{WIPE}"),
+        ({"force_terminal": True, "_environ": {"TERM": "dumb"}}, ""),
+        ({}, ""),
+    ],
+)
+def test_a_person_who_watches_sees_the_progress_unasked(monkeypatch, options, written):
+    def compile_(*given):
+        raise KeyboardInterrupt
+
+    screen = console(**options)
+    monkeypatch.setattr("hindrl_jax.training.progress.Console", lambda **_: screen)
+    monkeypatch.setattr("hindrl_jax.training.experiment.programs_of", compile_)
+    with pytest.raises(KeyboardInterrupt):
+        hindrl.fit(tiny.ENV, hindrl.record_demonstrations(tiny.ENV, 1), tiny.CONFIG)
+    assert screen.file.getvalue() == written
 
 
 def test_an_interrupted_training_leaves_the_line_clean():
