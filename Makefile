@@ -19,7 +19,7 @@ NEWEST_TOOLS = pytest pytest-xdist hypothesis ipython
 train: .venv/.installed  ## one demonstration, one seed, until it is solved: about two minutes with the installation
 	.venv/bin/hindrl train --env FixedGridPickAndPlace --algo hindrl --demos 1 --seed 2 --stop-at 0.98 --out runs/quickstart --overwrite
 
-test: .venv/.installed-test  ## two files at a time; each more needs 2 GiB of memory
+test: .venv/.installed-test  ## two files at a time; .pytest_cache keeps what it compiles for the next time
 	.venv/bin/python -m pytest --numprocesses auto --maxprocesses 2 --dist loadfile --no-loadscope-reorder
 
 test-newest: .venv-newest/bin/python  ## the fast tests with the newest JAX, Flax, Optax, Chex and MuJoCo, in an environment of its own
