@@ -19,13 +19,13 @@ NEWEST_TOOLS = pytest pytest-xdist hypothesis ipython
 train: .venv/.installed  ## one demonstration, one seed, until it is solved: about two minutes with the installation
 	.venv/bin/hindrl train --env FixedGridPickAndPlace --algo hindrl --demos 1 --seed 2 --stop-at 0.98 --out runs/quickstart --overwrite
 
-test: .venv/.installed-test  ## two files at a time; more would need 5 GiB of memory each
-	.venv/bin/python -m pytest --numprocesses auto --maxprocesses 2 --dist loadfile
+test: .venv/.installed-test  ## two files at a time; .pytest_cache keeps what it compiles for the next time
+	.venv/bin/python -m pytest --numprocesses auto --maxprocesses 2 --dist loadfile --no-loadscope-reorder
 
 test-newest: .venv-newest/bin/python  ## the fast tests with the newest JAX, Flax, Optax, Chex and MuJoCo, in an environment of its own
 	@$(NEWEST_PIP) -e '$(NEWEST_EXTRAS)' $(NEWEST_TOOLS)
 	@.venv-newest/bin/python -m pip list --disable-pip-version-check | grep -E '^(jax|jaxlib|flax|optax|chex|mujoco|mujoco-mjx|orbax-checkpoint|numpy) '
-	.venv-newest/bin/python -m pytest --numprocesses auto --maxprocesses 2 --dist loadfile --ignore tests/project
+	.venv-newest/bin/python -m pytest --numprocesses auto --maxprocesses 2 --dist loadfile --no-loadscope-reorder --ignore tests/project
 
 test-versions: test test-newest  ## both ends of what is supported: the locked versions, and the newest
 
@@ -39,7 +39,7 @@ test-interop: tests/interop/.venv/.installed  ## robomimic's own tools on our fi
 	tests/interop/.venv/bin/python -m pytest tests/interop
 
 coverage: .venv/.installed-test  ## which lines the fast tests run; build/coverage/index.html shows them
-	.venv/bin/python -m pytest --numprocesses auto --maxprocesses 2 --dist loadfile --cov --cov-report term:skip-covered --cov-report html
+	.venv/bin/python -m pytest --numprocesses auto --maxprocesses 2 --dist loadfile --no-loadscope-reorder --cov --cov-report term:skip-covered --cov-report html
 
 lint: .venv/.installed-test
 	.venv/bin/ruff check .

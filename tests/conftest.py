@@ -1,18 +1,74 @@
 """Strict settings for every test: no silent broadcasting between ranks, no random key consumed twice.
 
-The programs of the fast tests are small and run for an instant, so the compiler is set to optimise them little, also in processes that
-tests start.
+Programs of tests are small and run for an instant, so that most of the time goes into compiling them. A program is compiled once for all tests, test
+processes and processes that tests start, and kept in `.pytest_cache` for later runs; in the fast tests the compiler is set to optimise it little.
 """
 
+import contextlib
+import ctypes
+import gc
+import mmap
 import os
+import time
+from pathlib import Path
 
 import jax
+import jaxlib
+import pytest
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_debug_key_reuse", True)
 
+QUICK = ["--xla_backend_optimization_level=0", "--xla_llvm_disable_expensive_passes=true"]
+# Without these emitters, programs compile in a third of the time and memory. The compiler stops at a flag that it does not know.
+EMITTERS = "--xla_cpu_use_fusion_emitters"
+LONGEST = [f"test_{name}.py" for name in ("notebooks", "docs", "devices", "options", "golden", "checkpoints", "solves_a_task")]
+KEPT = 14 * 24 * 3600  # seconds after which a compiled program that no test used is deleted
+
+
+def known_to_the_compiler(flag):
+    for library in Path(jaxlib.__file__).parent.glob("libjax_common.*"):
+        with library.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            return content.find(flag.removeprefix("--").encode()) >= 0
+    return False
+
+
+def compiled_programs(config):
+    """The folder of compiled programs, without those of old."""
+    folder = config.cache.mkdir("compiled")
+    for program in folder.iterdir():
+        with contextlib.suppress(OSError):
+            if time.time() - program.stat().st_atime > KEPT:
+                program.unlink()
+    return folder
+
 
 def pytest_configure(config):
-    if "not slow" in config.option.markexpr:
-        quick = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {quick}".strip()  # read when JAX makes its first array
+    if not hasattr(config, "workerinput"):  # the processes of pytest-xdist are given what stands in the environment
+        if config.pluginmanager.hasplugin("cacheprovider"):
+            os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(compiled_programs(config)))
+        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+        if "not slow" in config.option.markexpr:
+            flags = [os.environ.get("XLA_FLAGS", ""), *QUICK, *([f"{EMITTERS}=false"] if known_to_the_compiler(EMITTERS) else [])]
+            os.environ["XLA_FLAGS"] = " ".join(flags).strip()  # read when JAX makes its first array
+    jax.config.update("jax_compilation_cache_dir", os.environ.get("JAX_COMPILATION_CACHE_DIR"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+def pytest_collection_modifyitems(items):
+    """The files that take longest come first, so that no process is left with one at the end."""
+    items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))
+
+
+def pytest_collection_finish():
+    """Python looks for garbage less often, and not among modules and tests, which stay: tracing makes many objects and hardly any cycles."""
+    gc.freeze()
+    gc.set_threshold(20_000, 50, 100)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def memory_is_given_back():
+    """What the compiler has freed lies in pieces that glibc keeps: two thirds of a process, in the end."""
+    yield
+    with contextlib.suppress(AttributeError):  # other C libraries have no such function
+        ctypes.CDLL(None).malloc_trim(0)

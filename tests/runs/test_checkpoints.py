@@ -26,7 +26,7 @@ CLONING = dataclasses.replace(CONFIG, algo="bc", steps=60)
 SEEDS = (3, 4)
 
 pytestmark = [
-    pytest.mark.usefixtures("compile_once", "unfinished_tasks_end_with_their_test"),
+    pytest.mark.usefixtures("unfinished_tasks_end_with_their_test"),
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),  # Orbax drops its other tasks when one fails
 ]
 

@@ -16,7 +16,7 @@ from hindrl_jax import cli
 from hindrl_jax.training.progress import ProgressBar
 
 pytestmark = [
-    pytest.mark.usefixtures("compile_once", "unfinished_tasks_end_with_their_test"),
+    pytest.mark.usefixtures("unfinished_tasks_end_with_their_test"),
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
 
