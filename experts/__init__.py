@@ -5,8 +5,8 @@ method act(key, env, state) -> action, or act(observation, rng) for environments
 """
 
 from hindrl_jax.experts.cable import CableExpert
-from hindrl_jax.experts.fetch import FetchPickAndPlaceExpert, FetchReachExpert
+from hindrl_jax.experts.fetch import FetchPickAndPlaceExpert, FetchPushExpert, FetchReachExpert, FetchSlideExpert
 from hindrl_jax.experts.grid import GridExpert
 from hindrl_jax.experts.reach import ReachExpert
 
-__all__ = ["CableExpert", "FetchPickAndPlaceExpert", "FetchReachExpert", "GridExpert", "ReachExpert"]
+__all__ = ["CableExpert", "FetchPickAndPlaceExpert", "FetchPushExpert", "FetchReachExpert", "FetchSlideExpert", "GridExpert", "ReachExpert"]
