@@ -34,6 +34,11 @@ class _FetchExpert:
         check_types(self)
         check(self, noise=(self.noise >= 0.0, "0 or more"))
 
+    @classmethod
+    def plays(cls, env_id: str) -> bool:
+        """Whether it is an expert of the environment that Gymnasium knows by that id: of its task, with a sparse reward."""
+        return env_id.startswith(f"{cls.tasks}-")
+
     def _command(self, towards: np.ndarray, fingers: float, rng: np.random.Generator) -> np.ndarray:
         """The action (4,) that moves the gripper by `towards` (3,), in m; fingers 1 opens, -1 closes."""
         displacement = towards / (_STEP * _BEHIND) + self.noise * rng.standard_normal(3)
