@@ -38,7 +38,17 @@ def relabel(key: Array, replay: ReplayState, steps: Steps, chosen: Array, source
       test: when a goal counts as reached.
     """
     observations, found = source(key, replay, steps.row, steps.step)
-    chosen = chosen & found
+    return with_goals_of(observations, steps, chosen & found, test)
+
+
+def with_goals_of(observations: Array, steps: Steps, chosen: Array, test: GoalTest) -> Steps:
+    """Gives chosen rows (B,) the goals that states (B, D) achieve, and the rewards of reaching them.
+
+    Where episodes have goals of their own, one that ended because its goal was reached goes on for another goal: its last state is not worth nothing.
+    """
+    if test.own_goals:
+        solved = jnp.any(steps.is_last & (steps.rewards > 0.0), axis=1)
+        steps = steps.replace(terminated=steps.terminated & ~(chosen & solved))
     goals = jnp.where(chosen[:, None], test.achieved_goal(observations), steps.desired_goal)
     return reward_by_goal(steps.replace(desired_goal=goals, is_relabelled=chosen), chosen, test)
 

@@ -21,6 +21,7 @@ from hindrl_jax.envs.reach import FixedParameterizedReach, ParameterizedReach
 from hindrl_jax.experts import fetch
 from hindrl_jax.experts.cable import CableExpert
 from hindrl_jax.experts.grid import GridExpert
+from hindrl_jax.experts.metaworld import MetaWorldExpert
 from hindrl_jax.experts.reach import ReachExpert
 from hindrl_jax.experts.robosuite_arm import play_in_robosuite
 from hindrl_jax.tasks import from_gymnasium
@@ -39,7 +40,8 @@ class Task:
     environment: type[Any]
     """Frozen dataclass; its fields are the environment's arguments."""
     expert: type[Any] | None
-    """Frozen dataclass with a method act(key, env, state), or for Gymnasium's environments act(observation, rng); None where nobody can show."""
+    """Frozen dataclass with a method act(key, env, state), or for Gymnasium's environments act(observation, rng), or acting_in(env), which
+    returns such a function; None where nobody can show."""
     viewer: Any
     """What has save_png(env, state, path) and animation(env, states, captions=None) -> (pictures (H, W, 3), seconds that each is shown): an object,
     or the name of a module, which is imported only to draw. None where nothing does, or the environment draws itself."""
@@ -121,7 +123,7 @@ def task(name: str) -> Task:
     """
     if name.startswith(from_gymnasium.PREFIX):
         environment = from_gymnasium.environment_class(name)
-        expert = next((expert for expert in fetch.EXPERTS if environment.id.rpartition(":")[2].startswith(f"{expert.tasks}-")), None)
+        expert = next((expert for expert in (*fetch.EXPERTS, MetaWorldExpert) if expert.plays(environment.id.rpartition(":")[2])), None)
         return Task(environment, expert, None, "an environment of Gymnasium")
     module, _, name = name.rpartition(":")
     if module:

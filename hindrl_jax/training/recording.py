@@ -46,7 +46,8 @@ def record_demonstrations(env: Environment, num_demos: int, *, seed: int = 0, ex
             raise UserError(f"no expert is known for {env.name}: give one, or demonstrations from a file, which hindrl_jax.record_gymnasium can make")
         expert = expert_class()
     if not can_step(env) and isinstance(env, Watchable):
-        return record_gymnasium(env, expert.act, num_demos, seed=seed)
+        policy = expert.acting_in(env) if hasattr(expert, "acting_in") else expert.act
+        return record_gymnasium(env, policy, num_demos, seed=seed)
     return record(jax.random.fold_in(jax.random.key(seed), 1), env, expert, num_demos)
 
 

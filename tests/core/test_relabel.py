@@ -52,8 +52,9 @@ def replay_of_both():
 NO_QUIRKS = QuirksConfig()
 
 
-def goal_test(quirks=NO_QUIRKS, epsilon=1.0):
+def goal_test(quirks=NO_QUIRKS, epsilon=1.0, own_goals=False):
     return GoalTest(
+        own_goals=own_goals,
         achieved_goal=Line().achieved_goal,
         epsilon=jnp.array([epsilon]),
         inclusive=not quirks.strict_goal_test,
@@ -151,6 +152,24 @@ def test_a_source_is_asked_for_the_rows_steps_and_where_it_finds_nothing_the_row
     assert counted.tolist() == [[1.0, 0.0], [0.0, 0.0], [1.0, 0.0], [1.0, 0.0], [0.0, 0.0]]
     for name in ("row", "step", "observation", "action", "next_observations", "inside", "is_last", "terminated"):
         np.testing.assert_array_equal(getattr(steps, name), getattr(recorded, name))
+
+
+def test_an_episode_that_ended_at_its_own_goal_goes_on_for_another():
+    # All rows get the goal 6, which is never near. Episode 1 ended at position 8, its own goal, within these two steps or this one; for the goal 6
+    # the value of position 8 counts, after two steps with 1/4 and after one with 1/2. Where all episodes aim at the same, a solved one is over for
+    # every goal. An end without reward is the environment's own, and an end for every goal, too.
+    batch_config = BatchConfig(hindrl_sampling_strategy="task_conditioned", n_step=2, gamma=0.5)
+    config, replay = TrainConfig(batch=batch_config), replay_of_both()
+    failed = replay.replace(episodes=replay.episodes.replace(rewards=jnp.zeros_like(replay.episodes.rewards)))
+    cases = (True, replay, [0.25, 0.5, 0.25, 0.0]), (False, replay, [0.0, 0.0, 0.25, 0.0]), (True, failed, [0.0, 0.0, 0.25, 0.0])
+    for own_goals, stored, discounts in cases:
+        steps = read_steps(stored.episodes, jnp.array([1, 1, 0, 1]), jnp.array([0, 1, 0, 1]), 2)
+        chosen, source = jnp.array([True, True, True, False]), goal_source(TABLE, batch_config)
+        steps = relabel(jax.random.key(0), stored, steps, chosen, source, goal_test(epsilon=0.5, own_goals=own_goals))
+        batch = transitions(steps, Line().achieved_goal, config, is_demonstration=False)
+        assert batch.discount.tolist() == discounts
+        assert batch.reward[:3].tolist() == [0.0, 0.0, 0.0]
+        assert batch.next_observation[:2, 0].tolist() == [8.0, 8.0]
 
 
 def test_a_demonstrated_goal_is_one_of_the_table():

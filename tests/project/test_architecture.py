@@ -38,6 +38,7 @@ BEYOND = {
     "meshes": {"importlib", "pathlib"},
     "opengl": {"ctypes", "importlib", "sys"},
     "installation": {"contextlib", "importlib", "io", "logging", "os", "sys", "warnings"},
+    "metaworld": {"warnings"},
     "scene": {"robosuite", "mujoco"},
     "arm": {"mujoco", "os", "sys"},
     "devices": {"importlib"},

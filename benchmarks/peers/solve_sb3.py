@@ -1,0 +1,90 @@
+"""TQC with hindsight experience replay of Stable-Baselines3, for `time_to_solve`: prints a line of JSON after every evaluation.
+
+    python solve_sb3.py --env FetchPush-v4 --seed 0 --steps 100000 --every 10000 --episodes 50 --module gymnasium_robotics
+
+The settings are those of the RL Zoo (hyperparams/tqc.yml), without its time feature and, for FetchReach, without its running normalisation of
+observations. With `--demos FILE` the demonstrations of an npz file (`time_to_solve.save_episodes`) are in its replay buffer from the beginning.
+Seconds count from the start of the program, without evaluations. All cores that the process may use.
+"""
+
+import argparse
+import importlib
+import json
+import time
+
+BEGAN = time.perf_counter()
+
+import episodes  # noqa: E402, the clock is to run from the start
+import gymnasium  # noqa: E402
+import numpy as np  # noqa: E402
+from sb3_contrib import TQC  # noqa: E402
+from stable_baselines3 import HerReplayBuffer  # noqa: E402
+from stable_baselines3.common.callbacks import BaseCallback  # noqa: E402
+
+SMALL = dict(batch_size=256, ent_coef="auto", learning_starts=1_000, policy_kwargs={"net_arch": [64, 64], "n_critics": 1})
+LARGE = dict(batch_size=2048, tau=0.05, policy_kwargs={"net_arch": [512, 512, 512], "n_critics": 2})
+SETTINGS = {"FetchReach": SMALL, "FetchPush": LARGE, "FetchSlide": LARGE, "FetchPickAndPlace": LARGE | {"batch_size": 1024}}
+
+
+class Evaluate(BaseCallback):
+    """Plays fresh episodes every so many steps."""
+
+    def __init__(self, env: gymnasium.Env, arguments: argparse.Namespace):
+        super().__init__()
+        self.env, self.arguments, self.spent = env, arguments, 0.0
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps % self.arguments.every:
+            return True
+        before = time.perf_counter()
+        seeds = range(10**6 * (1 + self.arguments.seed), 10**6 * (1 + self.arguments.seed) + self.arguments.episodes)
+        found = episodes.outcomes(lambda observation: self.model.predict(observation, deterministic=True)[0], self.env, seeds)
+        print(json.dumps({"steps": self.num_timesteps, "seconds": round(before - BEGAN - self.spent, 1)} | found), flush=True)
+        self.spent += time.perf_counter() - before
+        return True
+
+
+def add_demonstrations(buffer: HerReplayBuffer, path: str) -> None:
+    """Stores the episodes of a file, cut off where they end, so that their last states have values as after any time-out."""
+    with np.load(path) as file:
+        stored = dict(file)
+    for index, length in enumerate(stored["lengths"]):
+        goal = stored["desired_goal"][index]
+        for step in range(length):
+            now, then = (
+                {key: stored[key][index, at][None] for key in ("observation", "achieved_goal")} | {"desired_goal": goal[None]}
+                for at in (step, step + 1)
+            )
+            last = step == length - 1
+            info = {"TimeLimit.truncated": True} if last else {}
+            buffer.add(now, then, stored["actions"][index, step][None], np.array([float(last) - 1.0]), np.array([last]), [info])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--env", required=True)
+    parser.add_argument("--module", required=True, help="what registers it")
+    for name in ("seed", "steps", "every", "episodes"):
+        parser.add_argument(f"--{name}", type=int, required=True)
+    parser.add_argument("--demos", metavar="FILE")
+    arguments = parser.parse_args()
+    importlib.import_module(arguments.module)
+    model = TQC(
+        "MultiInputPolicy",
+        gymnasium.make(arguments.env),
+        replay_buffer_class=HerReplayBuffer,
+        replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"},
+        buffer_size=1_000_000,
+        gamma=0.95,
+        learning_rate=1e-3,
+        seed=arguments.seed,
+        device="cpu",
+        **SETTINGS[arguments.env.partition("-")[0]],
+    )
+    if arguments.demos:
+        add_demonstrations(model.replay_buffer, arguments.demos)
+    model.learn(arguments.steps, callback=Evaluate(gymnasium.make(arguments.env), arguments))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,77 @@
+"""The benchmark of other people's tasks: what it makes of its cells, and that it goes on where it was interrupted."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from benchmarks import time_to_solve
+from benchmarks.peers import episodes
+
+
+def cell(learner, seed, *reached, num_demos=20, task="FetchPush"):
+    points = [{"steps": 1000 * (i + 1), "seconds": 60.0 * (i + 1), "reached": value, "held": value / 2} for i, value in enumerate(reached)]
+    return {"task": task, "learner": learner, "num_demos": num_demos, "seed": seed, "points": points}
+
+
+def test_the_table_has_a_line_for_each_task_and_learner():
+    rows = [cell("sb3", 0, 0.1, 0.2, num_demos=0), cell("hindrl", 1, 0.5, 1.0, 0.9), cell("hindrl", 0, 0.96), cell("hindrl", 0, task="FetchReach")]
+    header, _, *lines = time_to_solve.table(rows).splitlines()
+    assert "minutes to it, median" in header
+    assert lines == [
+        "| FetchReach | `hindrl` | 20 | 0/1 |  |  | 0% (0%) | 0% |  |",
+        "| FetchPush | `hindrl` | 20 | 2/2 | 1,500 | 1.5 | 98% (96%) | 46% | 1,000 / 1 3,000 / 3 |",
+        "| FetchPush | `sb3` | 0 | 0/1 |  |  | 20% (20%) | 10% | 2,000 / 2 |",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("reached", "seconds", "kept"),
+    [
+        ([0.1, 0.2], 1000, 2),  # the worker ends by itself
+        ([0.96, 0.1, 0.97, 0.95, 1.0], 1000, 4),  # solved twice in a row
+        ([0.1, 0.2, 0.3], 125, 2),  # the third comes after two minutes and a bit
+    ],
+)
+def test_a_cell_ends_when_it_is_solved_or_its_time_is_over(reached, seconds, kept):
+    lines = "\n".join(json.dumps(point) for point in cell("hindrl", 0, *reached)["points"])
+    with subprocess.Popen([sys.executable, "-c", f"print({lines!r})"], stdout=subprocess.PIPE, text=True) as process:
+        points = time_to_solve.read_points(process, seconds)
+    assert [point["reached"] for point in points] == reached[:kept]
+
+
+def test_cells_that_are_there_are_not_run_again(tmp_path, monkeypatch, capsys):
+    ran = []
+
+    def run(cell_, given):
+        ran.append(cell_.name)
+        return cell(cell_.learner, cell_.seed, 1.0)
+
+    monkeypatch.setattr(time_to_solve, "run", run)
+    monkeypatch.setattr(time_to_solve, "plot", lambda rows, path: None)
+    given = ["--tasks", "FetchPush", "--learners", "hindrl", "sb3", "--out", str(tmp_path), "--peers", str(tmp_path / "none")]
+    for seeds in ("1", "2"):
+        monkeypatch.setattr(sys, "argv", ["time_to_solve", *given, "--seeds", seeds])
+        time_to_solve.main()
+    assert ran == ["FetchPush_hindrl_20_0", "FetchPush_hindrl_20_1"]
+    assert "FetchPush_sb3_0_0: left out" in capsys.readouterr().out
+    assert "2/2" in (tmp_path / "time_to_solve.md").read_text()
+
+
+class Counting:
+    """Solved at the steps that the seed says, of three."""
+
+    def reset(self, *, seed):
+        self.solved, self.step_number = {0: (), 1: (1,), 2: (2, 3)}[seed], 0
+        return {}, {}
+
+    def step(self, action):
+        self.step_number += 1
+        return {}, 0.0, False, self.step_number == 3, {"is_success": self.step_number in self.solved}
+
+
+def test_an_episode_is_reached_at_any_step_and_held_at_the_last():
+    found = episodes.outcomes(lambda observation: np.zeros(1), Counting(), range(3))
+    assert found == {"reached": pytest.approx(2 / 3), "held": pytest.approx(1 / 3)}
