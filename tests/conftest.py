@@ -14,6 +14,7 @@ from pathlib import Path
 
 import jax
 import jaxlib
+import psutil
 import pytest
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -23,6 +24,7 @@ QUICK = ["--xla_backend_optimization_level=0", "--xla_llvm_disable_expensive_pas
 # Without these emitters, programs compile in a third of the time and memory. The compiler stops at a flag that it does not know.
 EMITTERS = "--xla_cpu_use_fusion_emitters"
 LONGEST = [f"test_{name}.py" for name in ("notebooks", "docs", "devices", "options", "golden", "checkpoints", "solves_a_task")]
+ENOUGH = 1e9  # bytes of a test process
 KEPT = 14 * 24 * 3600  # seconds after which a compiled program that no test used is deleted
 
 
@@ -68,7 +70,12 @@ def pytest_collection_finish():
 
 @pytest.fixture(scope="module", autouse=True)
 def memory_is_given_back():
-    """What the compiler has freed lies in pieces that glibc keeps: two thirds of a process, in the end."""
+    """A compiled program takes 2 MB, however small, and a process has thousands in the end: it forgets them from time to time, since those that are
+    wanted again are on disk. What the compiler has freed lies in pieces that glibc keeps until it is asked for them.
+    """
     yield
+    if psutil.Process().memory_info().rss > ENOUGH:
+        jax.clear_caches()
+        gc.collect()
     with contextlib.suppress(AttributeError):  # other C libraries have no such function
         ctypes.CDLL(None).malloc_trim(0)
