@@ -39,6 +39,7 @@ BEYOND = {
     "opengl": {"ctypes", "importlib", "sys"},
     "installation": {"contextlib", "importlib", "io", "logging", "os", "sys", "warnings"},
     "scene": {"robosuite", "mujoco"},
+    "cable_scene": {"robosuite"},
     "arm": {"mujoco", "os", "sys"},
     "devices": {"importlib"},
     "by_hand": {"contextlib", "time"},
