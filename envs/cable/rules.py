@@ -66,7 +66,8 @@ class CableTask(abc.ABC):
     """Links of each cable in MuJoCo; the closed form's have none."""
     backend: Backend = "closed_form"
     """Who simulates: closed_form (for bulk training), mujoco (C MuJoCo, many episodes side by side, some fifty times slower), mjx (the same
-    equations in JAX, for GPUs), or robosuite (its arms, on the CPU, to record by hand or to evaluate)."""
+    equations in JAX, for GPUs; not to insert, as it throws out of the hand a plug that is pressed against the bore), or robosuite (its arms, on the
+    CPU, to record by hand or to evaluate)."""
 
     def __post_init__(self):
         check_types(self)
