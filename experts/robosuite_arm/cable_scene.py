@@ -35,7 +35,7 @@ def environment_class() -> type[Any]:
     Raises:
       UserError: see `import_robosuite`.
     """
-    base = scene_class()
+    base: Any = scene_class()
     with quiet():
         from robosuite.models.arenas import EmptyArena
         from robosuite.models.tasks import ManipulationTask
@@ -111,7 +111,7 @@ class RobosuiteCables(RobosuiteScene):
         self.environment.step(np.asarray(command, float))
         self._undo_shortcuts()
         closing = np.array([robot.gripper["right"].current_action[0] for robot in self.environment.robots])
-        return np.float32(0.5 * geometry.MAX_FINGER * (1.0 + closing)), self.joints()
+        return (0.5 * geometry.MAX_FINGER * (1.0 + closing)).astype(np.float32), self.joints()
 
     def joints(self) -> chains.Joints:
         """Where everything is now."""

@@ -132,7 +132,7 @@ def _act(act: Act, key: Array, state: Any, observation: Array) -> Array:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _start(env: Task, key: Array) -> tuple[Any, Array, Array]:
+def _start(env: Any, key: Array) -> tuple[Any, Array, Array]:
     state, observation = env.reset(key)
     return state, observation, env.state_to_vector(state)
 
@@ -144,6 +144,6 @@ def _command(env: Task, action: Array) -> tuple[Array, Array]:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _arrive(env: Task, state: Any, moved: tuple[Any, Any]) -> tuple[Any, TimeStep, Array]:
+def _arrive(env: Any, state: Any, moved: tuple[Any, Any]) -> tuple[Any, TimeStep, Array]:
     state, time_step = env.arrive(state, *moved)
     return state, time_step, env.state_to_vector(state)

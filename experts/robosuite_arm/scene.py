@@ -72,7 +72,7 @@ def environment_class() -> type[Any]:
     Raises:
       UserError: see `import_robosuite`.
     """
-    base = scene_class()
+    base: Any = scene_class()
     with quiet():
         import mujoco
         from robosuite.models.arenas import EmptyArena
