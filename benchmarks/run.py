@@ -49,6 +49,7 @@ def main() -> None:
     from benchmarks import (
         cable_holding,
         cable_parity,
+        cable_safety,
         cable_speed,
         environments,
         gradient_step,
@@ -71,6 +72,7 @@ def main() -> None:
         "reach_parity": reach_parity,
         "cable_speed": cable_speed,
         "cable_parity": cable_parity,
+        "cable_safety": cable_safety,
         "cable_holding": cable_holding,
         "host_loop": host_loop,
         "relabelling": relabelling,

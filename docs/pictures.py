@@ -1,5 +1,5 @@
-"""Draws the pictures of README and of the pages: docs/how_it_works.png, docs/environments.png, docs/epsilon_filter.png, docs/values.png and,
-of the runs that are there, docs/panda.gif, docs/grid.gif and docs/grid_curve.png.
+"""Draws the pictures of README and of the pages: docs/how_it_works.png, environments.png, epsilon_filter.png, cable_expert.png, values.png and, of the
+runs that are there, docs/panda.gif, docs/grid.gif and docs/grid_curve.png.
 
     hindrl train --env FixedGridPickAndPlace --demos 1 --seed 2 --stop-at 0.98 --out runs/quickstart
     hindrl train --env FixedParameterizedReach --demos 1 --seed 0 --stop-at 0.98 --out runs/reach
@@ -24,6 +24,7 @@ from hindrl_jax.envs.grid import viewer as grid_viewer
 from hindrl_jax.envs.reach import viewer as reach_viewer
 from hindrl_jax.runs.reader import load_run
 from hindrl_jax.tasks.registry import make
+from hindrl_jax.training.recording import record_demonstrations
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -40,6 +41,7 @@ def main() -> None:
     environments(DOCS / "environments.png")
     epsilon_filter(DOCS / "epsilon_filter.png")
     values(DOCS / "values.png")
+    cable_expert(DOCS / "cable_expert.png")
     for run, film in (("reach", "panda.gif"), ("quickstart", "grid.gif")):
         if (RUNS / run).is_dir():
             cli.main(["render", str(RUNS / run), "--to", str(DOCS / film)])
@@ -137,6 +139,32 @@ def epsilon_filter(path: Path) -> None:
         demos = str(Path(folder) / "demos.hdf5")
         cli.main(["demos", "record", "--env", "FixedParameterizedReach", "--demos", "1", "--out", demos])
         cli.main(["demos", "plot", demos, "--epsilon-steps", "20", "--to", str(path)])
+
+
+def cable_expert(path: Path) -> None:
+    """The stages of the expert of the cable tasks, in C MuJoCo, as thesis figure 4.4 has them."""
+    env = make("CableInsertion", backend="mujoco")
+    demonstration = jax.tree.map(lambda leaf: np.asarray(leaf[0]), record_demonstrations(env, num_demos=1, seed=0))
+    seen = demonstration.observations[: demonstration.lengths + 1]
+    far = np.linalg.norm(seen[:, 18:24].reshape(-1, 2, 3), axis=2)  # from each hand to its head, m
+    held, to_bottom = (seen[:, 27:29] > 0.5).all(axis=1), np.linalg.norm(seen[:, 24:27], axis=1)
+    moments = {
+        "1  to a place before the grip, with a shaky hand": np.argmax(far.max(axis=1) < 0.15),
+        "2  straight to the grip": np.argmax(far.min(axis=1) < 0.02),
+        "3, 4  close the fingers, wait for the other arm": np.argmax(held),
+        "5  to the meeting, with shaky hands": np.argmax(held) + np.argmax(to_bottom[held] < 0.2),
+        "6  align the plug before the mouth": np.argmax(held & (to_bottom < 0.045)),
+        "7  push it in": demonstration.lengths,
+    }
+    figure, axes = plt.subplots(2, 3, figsize=(12, 7.6), dpi=110)
+    for axis, (title, step) in zip(axes.flat, moments.items(), strict=True):
+        state = env.vector_to_state(jax.random.key(0), demonstration.states[step])
+        axis.imshow(cable_viewer.frame(env, state))
+        axis.set_title(title, fontsize=11, color=INK, loc="left")
+        axis.axis("off")
+    figure.subplots_adjust(0.0, 0.0, 1.0, 0.96, 0.02, 0.06)
+    figure.savefig(path, facecolor="white", pil_kwargs={"optimize": True})
+    plt.close(figure)
 
 
 if __name__ == "__main__":

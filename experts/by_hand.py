@@ -1,4 +1,4 @@
-"""Recording demonstrations of the reach tasks by hand: a person steers robosuite's arm, shown in a window, with one of robosuite's devices."""
+"""Recording demonstrations by hand: a person steers robosuite's arm, or one of its two, shown in a window, with one of robosuite's devices."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ import numpy as np
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Array, Episodes
 from hindrl_jax.envs import panda
-from hindrl_jax.envs.reach import ReachTask
-from hindrl_jax.experts.robosuite_arm import DeviceName, RobosuiteArm, open_device, play_episode, stacked
+from hindrl_jax.envs.cable import CableTask
+from hindrl_jax.experts.robosuite_arm import DeviceName, RobosuiteScene, Task, build_scene, open_device, play_episode, stacked
 
 FULL_TRANSLATION, FULL_ROTATION = 0.05, 0.5  # m and rad that robosuite's default controller makes of a device's 1
 CONTROLS = {
     "keyboard": "arrow keys: sideways, to and fro; ; and . : up and down; r e, y h, o p: turn about x, y, z; q: start over",
     "spacemouse": "push and twist the cap to move and turn the hand; right button: start over",
 }
+WITH_TWO_ARMS = "; space: close or open the fingers; =: the other arm"
 
 
 class _StartOver(Exception):
@@ -32,7 +33,7 @@ class _WindowClosed(Exception):
     """The person has had enough."""
 
 
-def record_by_hand(key: Array, env: ReachTask, device: DeviceName, num_demos: int, *, report: Callable[[str], None] = lambda line: None) -> Episodes:
+def record_by_hand(key: Array, env: Task, device: DeviceName, num_demos: int, *, report: Callable[[str], None] = lambda line: None) -> Episodes:
     """Records demonstrations that a person plays. Unsolved episodes are discarded.
 
     An episode begins with the first movement, runs at 20 Hz, and ends when the task is solved or the horizon reached: 300 steps are 15 seconds.
@@ -54,35 +55,37 @@ def record_by_hand(key: Array, env: ReachTask, device: DeviceName, num_demos: in
         raise UserError(f"num_demos = {num_demos} is too few: record at least 1 demonstration")
     if device not in get_args(DeviceName):
         raise UserError(f"there is no device {device!r}: choose one of {', '.join(get_args(DeviceName))}")
+    if isinstance(env, CableTask) and device != "keyboard":
+        raise UserError(f"two arms need a device that keeps one hand closed while the other moves, and the {device} does not: use the keyboard")
     if env.steps_in_jax:
         raise UserError(f"a person steers the arm of robosuite, not that of backend = {env.backend}: use backend = robosuite")
-    arm = RobosuiteArm(env.num_waypoints, on_screen=True)
-    with contextlib.closing(arm):
-        opened = open_device(device, arm)
-        arm.refresh()
-        report(f"{CONTROLS[device]}; close the window to stop early")
+    scene = build_scene(env, on_screen=True)
+    with contextlib.closing(scene):
+        opened = open_device(device, scene)
+        scene.refresh()
+        report(f"{CONTROLS[device]}{WITH_TWO_ARMS if isinstance(env, CableTask) else ''}; close the window to stop early")
         try:
-            return record_with(key, env, arm, opened, num_demos, report=report)
+            return record_with(key, env, scene, opened, num_demos, report=report)
         finally:
             opened.listener.stop()
 
 
 def record_with(
     key: Array,
-    env: ReachTask,
-    arm: RobosuiteArm,
+    env: Task,
+    scene: RobosuiteScene,
     device: Any,
     num_demos: int,
     *,
     report: Callable[[str], None] = lambda line: None,
     period: float = panda.CONTROL_PERIOD,
 ) -> Episodes:
-    """`record_by_hand`, with an arm and a device that are open; `period` is the time between two steps in s."""
+    """`record_by_hand`, with a scene and a device that are open; `period` is the time between two steps in s."""
     kept: list[Episodes] = []
     while len(kept) < num_demos:
         key, key_episode = jax.random.split(key)
         try:
-            episode = play_episode(key_episode, env, arm, _Hand(arm, device, period))
+            episode = play_episode(key_episode, env, scene, _Hand(scene, device, period, has_two_arms=isinstance(env, CableTask)))
         except _StartOver:
             report("discarded: started over")
         except (_WindowClosed, KeyboardInterrupt):
@@ -102,26 +105,26 @@ def record_with(
 class _Hand:
     """The person of one episode, as a policy that looks at the screen instead of the state."""
 
-    def __init__(self, arm: RobosuiteArm, device: Any, period: float):
-        self._arm, self._device, self._period = arm, device, period
+    def __init__(self, scene: RobosuiteScene, device: Any, period: float, *, has_two_arms: bool = False):
+        self._scene, self._device, self._period, self._has_two_arms = scene, device, period, has_two_arms
         self._moved, self._due = False, time.monotonic()
         device.start_control()
 
     def __call__(self, key: Array, state: Any, observation: Array) -> Any:
-        """Waits for the next step's turn, and at the beginning of the episode for a movement; returns the action (6,)."""
+        """Waits for the next step's turn, and at the beginning of the episode for a movement; returns the action (A,)."""
         del key, state, observation
         while True:
             self._due = max(self._due + self._period, time.monotonic())  # after a delay, go on from there instead of hurrying
             time.sleep(max(0.0, self._due - time.monotonic()))
-            if not self._arm.is_open():
+            if not self._scene.is_open():
                 raise _WindowClosed
             command = command_of(self._device)
             if command is None:
                 raise _StartOver
             self._moved = self._moved or bool(command.any())
             if self._moved:
-                return command
-            self._arm.refresh()
+                return for_both_arms(self._device, command) if self._has_two_arms else command
+            self._scene.refresh()
 
 
 def command_of(device: Any) -> np.ndarray | None:
@@ -142,3 +145,17 @@ def command_of(device: Any) -> np.ndarray | None:
     roll, pitch, yaw = given["raw_drotation"]
     translation, rotation = device._postprocess_device_outputs(np.asarray(given["dpos"], float), np.array([pitch, roll, -yaw]))
     return np.asarray(panda.shortened_command(jnp.asarray([*FULL_TRANSLATION * translation, *FULL_ROTATION * rotation], jnp.float32)))
+
+
+def for_both_arms(device: Any, command: np.ndarray) -> np.ndarray:
+    """The action (14,) of the cable tasks: the arm that the device steers now takes its command (6,), the other one stays, and each keeps its fingers
+    closed or open as it was last told to.
+
+    Args:
+      device: robosuite's keyboard, or anything with its attributes `active_robot` and `grasp_states`, of two robots of one arm each.
+      command: in m and rad, from `command_of`.
+    """
+    action = np.zeros((2, 7), np.float32)
+    action[device.active_robot, :6] = command
+    action[:, 6] = [1.0 if closes else -1.0 for (closes,) in device.grasp_states]
+    return action.reshape(-1)

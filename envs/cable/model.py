@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import functools
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -75,16 +76,54 @@ def xml(num_links: int) -> str:
     """
     root = ET.fromstring(_OPTIONS)
     world, contact, actuator = (root.find(name) for name in ("worldbody", "contact", "actuator"))
-    x, _, z = geometry.ANCHORS[0]
-    _add(world, "geom", name="bar", type="capsule", fromto=(x, -0.45, z, x, 0.45, z), size=0.01, material="bar")
+    bar, *cables = hanging(num_links)
+    world.append(bar)
     for index, name in enumerate(HEADS):
         world.append(_arm(name, geometry.BASES[index]))
         _add_actuators(actuator, name)
-    for index, name in enumerate(HEADS):
-        world.append(_cable(name, index, num_links))
-    _add_contacts(contact)
+    world.extend(cables)
+    contact.extend(pairs([[f"{name}_{side}_pad" for side in ("left", "right")] for name in HEADS]))
+    for first in ("palm", "left_bar", "right_bar"):
+        for second in ("palm", "left_bar", "right_bar"):
+            _add(contact, "pair", geom1=f"plug_{first}", geom2=f"socket_{second}", condim=1)
     ET.indent(root)
     return ET.tostring(root, encoding="unicode")
+
+
+def materials() -> list[ET.Element]:
+    """What `hanging` is painted with."""
+    return ET.fromstring(_OPTIONS).findall("asset/material")
+
+
+def hanging(num_links: int) -> list[ET.Element]:
+    """The bar, and the two cables that hang from it, for the world of any model whose geoms have no mass and touch nothing unless they say so."""
+    x, _, z = geometry.ANCHORS[0]
+    root = ET.Element("worldbody")
+    _add(root, "geom", name="bar", type="capsule", fromto=(x, -0.45, z, x, 0.45, z), size=0.01, material="bar")
+    return [*root, *(_cable(name, index, num_links) for index, name in enumerate(HEADS))]
+
+
+def pairs(pads: Sequence[Sequence[str]]) -> list[ET.Element]:
+    """What touches: pads and grips, pin and bore, plug and socket.
+
+    Args:
+      pads: for the plug and for the socket, the names of the geoms that are the pads of their arm's fingers.
+    """
+    contact = ET.Element("contact")
+    for name, of_arm in zip(HEADS, pads, strict=True):
+        for pad in of_arm:
+            _add(contact, "pair", geom1=pad, geom2=f"{name}_grip", **_GRIP_CONTACT)
+    for k in range(_WALLS):
+        for part in ("wall", "slant"):
+            _add(contact, "pair", geom1="pin", geom2=f"{part}{k}", **_PIN_CONTACT)
+    _add(contact, "pair", geom1="pin", geom2="bottom", **_PIN_CONTACT)
+    _add(contact, "pair", geom1="plug_body", geom2="socket_body", condim=1)
+    return list(contact)
+
+
+def joint_names(num_links: int) -> list[str]:
+    """The joints of the cables, as they stand in the state of `chains`."""
+    return [joint.get("name", "") for cable in hanging(num_links)[1:] for joint in cable.iter("joint")]
 
 
 def _add(parent: ET.Element, tag: str, **attributes: Any) -> ET.Element:
@@ -202,20 +241,6 @@ def _add_bore(head: ET.Element) -> None:
         _add(head, "geom", name=f"slant{k}", type="box", size=size, pos=place, quat=turned, material="socket")
     _add(head, "geom", name="bottom", type="box", size=(0.009, 0.009, 0.025), pos=(0, 0, bottom - 0.025), material="socket")
     _add(head, "site", name="socket_bottom", pos=(0, 0, bottom))
-
-
-def _add_contacts(contact: ET.Element) -> None:
-    for name in HEADS:
-        for side in ("left", "right"):
-            _add(contact, "pair", geom1=f"{name}_{side}_pad", geom2=f"{name}_grip", **_GRIP_CONTACT)
-    for k in range(_WALLS):
-        for part in ("wall", "slant"):
-            _add(contact, "pair", geom1="pin", geom2=f"{part}{k}", **_PIN_CONTACT)
-    _add(contact, "pair", geom1="pin", geom2="bottom", **_PIN_CONTACT)
-    _add(contact, "pair", geom1="plug_body", geom2="socket_body", condim=1)
-    for first in ("palm", "left_bar", "right_bar"):
-        for second in ("palm", "left_bar", "right_bar"):
-            _add(contact, "pair", geom1=f"plug_{first}", geom2=f"socket_{second}", condim=1)
 
 
 def _quaternion(axis: Any, angle: float) -> np.ndarray:

@@ -65,8 +65,9 @@ class CableTask(abc.ABC):
     num_links: int = 5
     """Links of each cable in MuJoCo; the closed form's have none."""
     backend: Backend = "closed_form"
-    """Who simulates: closed_form (for bulk training), mujoco (C MuJoCo, many episodes side by side, some fifty times slower), or mjx (the same
-    equations in JAX, for GPUs)."""
+    """Who simulates: closed_form (for bulk training), mujoco (C MuJoCo, many episodes side by side, some fifty times slower), mjx (the same
+    equations in JAX, for GPUs; not to insert, as it throws out of the hand a plug that is pressed against the bore), or robosuite (its arms, on the
+    CPU, to record by hand or to evaluate)."""
 
     def __post_init__(self):
         check_types(self)
@@ -77,6 +78,11 @@ class CableTask(abc.ABC):
             randomised=(not self.randomised or self.backend == "closed_form", f"false with backend = {self.backend}"),
             num_links=(2 <= self.num_links <= 20, "from 2 to 20"),
         )
+
+    @property
+    def steps_in_jax(self) -> bool:
+        """False with robosuite, which simulates outside JAX; see `hindrl_jax.base.environments.can_step`."""
+        return self.backend != "robosuite"
 
     @property
     def compiler_options(self) -> dict[str, Any]:
@@ -183,10 +189,27 @@ class CableTask(abc.ABC):
 
         Returns:
           The next state, and the time step with the true next observation.
+
+        Raises:
+          ValueError: with the robosuite back end.
         """
+        if not self.steps_in_jax:
+            raise ValueError("robosuite simulates outside JAX and cannot be compiled: use play_in_robosuite of hindrl_jax.experts.robosuite_arm")
         commands = jnp.clip(action, self.action_low, self.action_high).reshape(2, 7)
         finger_targets = jnp.clip(state.finger_targets - _FINGER_STEP * jnp.sign(commands[:, 6]), 0.0, geometry.MAX_FINGER)
-        physics = self._dynamics.control_step(state.physics, state.rest, finger_targets, commands[:, :6])
+        return self.arrive(state, finger_targets, self._dynamics.control_step(state.physics, state.rest, finger_targets, commands[:, :6]))
+
+    def arrive(self, state: CableState, finger_targets: Array, physics: Any) -> tuple[CableState, TimeStep]:
+        """The rest of a step, once arms and cables have moved: rewards and observes.
+
+        Args:
+          state: before the step.
+          finger_targets: (2,) m, where the grippers' commands want the fingers.
+          physics: after it, in the form of the back end: that of `chains` for MuJoCo, MJX and robosuite.
+
+        Returns:
+          As `step`.
+        """
         scene = self._dynamics.scene(physics)
         state = state.replace(finger_targets=finger_targets, physics=physics, scene=scene, step=state.step + 1)
         terminated = self.is_solved(scene)
@@ -218,8 +241,8 @@ class CableTask(abc.ABC):
 
     @property
     def _dynamics(self) -> Any:
-        """The module that simulates."""
-        return {"closed_form": closed_form, "mujoco": mujoco_dynamics, "mjx": mjx_dynamics}[self.backend]
+        """The module that simulates, or for robosuite, which does not, the one that knows its states."""
+        return {"closed_form": closed_form, "mujoco": mujoco_dynamics, "mjx": mjx_dynamics, "robosuite": chains}[self.backend]
 
     def _shapes(self) -> CableState:
         """The shapes of a state, with its physics in their compact form."""

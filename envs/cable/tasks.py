@@ -27,7 +27,7 @@ class BringNear(CableTask):
 
     def __post_init__(self):
         super().__post_init__()
-        check(self, position_tolerance=(self.position_tolerance > 0, "greater than 0"))
+        check(self, position_tolerance=_between_tips(self.position_tolerance))
 
     @property
     def depth(self) -> float:
@@ -58,8 +58,8 @@ class CableInsertion(CableTask):
         super().__post_init__()
         check(
             self,
-            position_tolerance=(self.position_tolerance > 0, "greater than 0"),
-            rotation_tolerance=(self.rotation_tolerance > 0, "greater than 0"),
+            position_tolerance=_between_tips(self.position_tolerance),
+            rotation_tolerance=(0 < self.rotation_tolerance < np.pi, "greater than 0 and less than pi, since heads hang side by side at first"),
         )
 
     @property
@@ -74,6 +74,12 @@ class CableInsertion(CableTask):
         plug, socket = scene.head_rotations[:, :, 2]
         is_there = _distance(tip_error(scene, self.depth)) < self.position_tolerance
         return is_there & (rotations.angle(plug, -socket) < self.rotation_tolerance)
+
+
+def _between_tips(tolerance: float) -> tuple[bool, str]:
+    """Whether a distance in m is one that hanging tips do not keep of themselves, and what it must be."""
+    apart = float(np.linalg.norm(geometry.HANGING_GRIPS[0] - geometry.HANGING_GRIPS[1]))
+    return 0 < tolerance < apart, f"greater than 0 and less than {apart:.2f}, as far as hanging tips are apart"
 
 
 def _distance(vector: Array) -> Array:

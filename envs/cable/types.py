@@ -8,7 +8,7 @@ from flax import struct
 
 from hindrl_jax.base.types import Array
 
-Backend = Literal["closed_form", "mujoco", "mjx"]
+Backend = Literal["closed_form", "mujoco", "mjx", "robosuite"]
 """What simulates arms and cables."""
 
 

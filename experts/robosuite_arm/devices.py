@@ -1,4 +1,4 @@
-"""The devices of robosuite with which a person steers the arm."""
+"""The devices of robosuite with which a person steers an arm."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import importlib
 from typing import Any, Literal
 
 from hindrl_jax.base.errors import UserError, one_line
-from hindrl_jax.experts.robosuite_arm.arm import RobosuiteArm
+from hindrl_jax.experts.robosuite_arm.arm import RobosuiteScene
 from hindrl_jax.experts.robosuite_arm.installation import quiet
 
 DeviceName = Literal["keyboard", "spacemouse"]
 
 
-def open_device(name: DeviceName, arm: RobosuiteArm) -> Any:
+def open_device(name: DeviceName, scene: RobosuiteScene) -> Any:
     """One of robosuite's devices, listening.
 
     Args:
       name: which.
-      arm: what it steers.
+      scene: what it steers.
 
     Raises:
       UserError: if a package that it needs is missing or does not work here, or it is not plugged in.
@@ -35,6 +35,6 @@ def open_device(name: DeviceName, arm: RobosuiteArm) -> Any:
         raise UserError(f"the {name} cannot be used ({one_line(error)}): pip install hidapi, and libhidapi-hidraw0 on Debian") from error
     try:
         with quiet():
-            return device(env=arm.environment)
+            return device(env=scene.environment)
     except OSError as error:
         raise UserError(f"the {name} cannot be opened ({one_line(error)}): is it plugged in, and may you read it?") from error

@@ -1,6 +1,6 @@
-"""Playing episodes of the reach tasks in robosuite, one after the other, outside JAX.
+"""Playing episodes of the reach and the cable tasks in robosuite, one after the other, outside JAX.
 
-robosuite only moves the arm. Waypoints and start come from `env.reset`; observation, reward and progress from `env.arrive`, as with the other back
+robosuite only moves arms and cables. The start comes from `env.reset`; observation, reward and progress from `env.arrive`, as with the other back
 ends.
 """
 
@@ -16,23 +16,47 @@ import numpy as np
 
 from hindrl_jax.base.environments import action_from_env, command_of
 from hindrl_jax.base.types import Array, Episodes, TimeStep
-from hindrl_jax.envs.reach import ReachState, ReachTask
-from hindrl_jax.experts.robosuite_arm.arm import RobosuiteArm, shared_arm
+from hindrl_jax.envs.cable import CableTask
+from hindrl_jax.envs.reach import ReachTask
+from hindrl_jax.experts.robosuite_arm.arm import RobosuiteArm, RobosuiteScene
+from hindrl_jax.experts.robosuite_arm.cable_scene import RobosuiteCables
 
-Act = Callable[[Array, ReachState, Array], Array]
-"""(key, state, observation (D,)) -> action (6,) in the environment's own units."""
+Task = ReachTask | CableTask
+Act = Callable[[Array, Any, Array], Array]
+"""(key, state, observation (D,)) -> action (A,) in the environment's own units."""
 
 
-def play_in_robosuite(key: Array, env: ReachTask, act: Act, num_episodes: int, num_held: int = 1) -> Episodes:
-    """Plays episodes one after the other, with the arm in robosuite.
+def build_scene(env: Task, *, on_screen: bool = False) -> Any:
+    """The scene in which a task is played, with the methods `begin` and `step`.
 
-    Equal keys give the same starts, waypoints and keys for `act` as in `hindrl_jax.training.recording.play`. `act` is compiled once, however often
+    Raises:
+      UserError: as `RobosuiteScene`.
+    """
+    return RobosuiteCables(env.num_links, on_screen=on_screen) if isinstance(env, CableTask) else RobosuiteArm(env.num_waypoints, on_screen=on_screen)
+
+
+_shared: dict[Any, RobosuiteScene] = {}
+
+
+def shared_scene(env: Task) -> Any:
+    """One scene for all episodes of this process: building it takes seconds, and a reset takes milliseconds and leaves nothing behind."""
+    kind = ("cables", env.num_links) if isinstance(env, CableTask) else ("arm", env.num_waypoints)
+    if kind not in _shared:
+        _shared[kind] = build_scene(env)
+    return _shared[kind]
+
+
+def play_in_robosuite(key: Array, env: Task, act: Act, num_episodes: int, num_held: int = 1) -> Episodes:
+    """Plays episodes one after the other, with the arms in robosuite.
+
+    Equal keys give the same starts and keys for `act` as in `hindrl_jax.training.recording.play`. `act` is compiled once, however often
     this is called with it.
 
     Args:
       key: random key.
       env: the task, of any back end.
-      act: (key, state, observation (D,)) -> action (6,) in m and rad, which is clipped to the environment's bounds before it goes to robosuite.
+      act: (key, state, observation (D,)) -> action (A,) in the environment's own units, clipped to its bounds before it goes to
+        robosuite.
       num_episodes: N.
       num_held: steps for which each action is held.
 
@@ -42,18 +66,18 @@ def play_in_robosuite(key: Array, env: ReachTask, act: Act, num_episodes: int, n
     Raises:
       UserError: if robosuite is missing or unusable.
     """
-    arm = shared_arm(env.num_waypoints)
-    episodes = [play_episode(key, env, arm, functools.partial(_act, act), num_held) for key in jax.random.split(key, num_episodes)]
+    scene = shared_scene(env)
+    episodes = [play_episode(key, env, scene, functools.partial(_act, act), num_held) for key in jax.random.split(key, num_episodes)]
     return stacked(episodes)
 
 
-def play_episode(key: Array, env: ReachTask, arm: RobosuiteArm, act: Act, num_held: int = 1) -> Episodes:
+def play_episode(key: Array, env: Task, scene: Any, act: Act, num_held: int = 1) -> Episodes:
     """Plays one episode on the host.
 
     Args:
       key: random key.
       env: the task.
-      arm: anything with the methods `reset` and `step` of `RobosuiteArm`.
+      scene: from `build_scene`, or anything with its methods `begin` and `step`.
       act: as for `play_in_robosuite`, but any Python function.
       num_held: steps for which each action is held.
 
@@ -62,15 +86,15 @@ def play_episode(key: Array, env: ReachTask, arm: RobosuiteArm, act: Act, num_he
     """
     key_reset, key = jax.random.split(key)
     state, observation, vector = _start(env, key_reset)
-    arm.reset(*jax.device_get((state.joints, state.positions, state.rotations)))
+    scene.begin(state)
     observations, states, actions, rewards = [observation], [vector], [], []
     for index in range(env.horizon):
         key, key_act = jax.random.split(key)
         if index % num_held == 0:
             decision = act(key_act, state, observation)
         command, normalised = _command(env, command_of(decision, index % num_held, env.action_dim))
-        joints, velocities = arm.step(np.asarray(command))
-        state, time_step, vector = _arrive(env, state, np.float32(joints), np.float32(velocities))
+        moved = jax.tree.map(np.float32, scene.step(np.asarray(command)))
+        state, time_step, vector = _arrive(env, state, moved)
         observation = time_step.observation
         actions.append(normalised)
         rewards.append(time_step.reward)
@@ -103,23 +127,23 @@ def stacked(episodes: list[Episodes]) -> Episodes:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _act(act: Act, key: Array, state: ReachState, observation: Array) -> Array:
+def _act(act: Act, key: Array, state: Any, observation: Array) -> Array:
     return act(key, state, observation)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _start(env: ReachTask, key: Array) -> tuple[ReachState, Array, Array]:
+def _start(env: Any, key: Array) -> tuple[Any, Array, Array]:
     state, observation = env.reset(key)
     return state, observation, env.state_to_vector(state)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _command(env: ReachTask, action: Array) -> tuple[Array, Array]:
+def _command(env: Task, action: Array) -> tuple[Array, Array]:
     """The action as robosuite gets it, and as it is recorded."""
     return jnp.clip(action, env.action_low, env.action_high), action_from_env(action, env)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _arrive(env: ReachTask, state: ReachState, joints: Array, velocities: Array) -> tuple[ReachState, TimeStep, Array]:
-    state, time_step = env.arrive(state, joints, velocities)
+def _arrive(env: Any, state: Any, moved: tuple[Any, Any]) -> tuple[Any, TimeStep, Array]:
+    state, time_step = env.arrive(state, *moved)
     return state, time_step, env.state_to_vector(state)

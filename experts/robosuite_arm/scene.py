@@ -1,4 +1,4 @@
-"""The reach tasks as an environment of robosuite: the arm, its controller, and waypoints to look at.
+"""What our environments of robosuite share, and the one of the reach tasks: the arm, its controller, and waypoints to look at.
 
 The controller is robosuite's IK_POSE at 20 Hz, with its broken default input type put right; `hindrl_jax.envs.panda.controller` restates it.
 """
@@ -21,21 +21,65 @@ _BASE, _HAND, _GRIP_SITE = "robot0_link0", "robot0_right_hand", "gripper0_right_
 
 
 @functools.cache
-def environment_class() -> type[Any]:
-    """`RobosuiteReach`, a class that can exist only once robosuite does.
+def scene_class() -> type[Any]:
+    """`RobosuiteScene`, what our environments of robosuite share; a class that can exist only once robosuite does.
 
     Raises:
       UserError: see `import_robosuite`.
     """
     import_robosuite()
     with quiet():
-        import mujoco
         from robosuite.environments.manipulation.manipulation_env import ManipulationEnv
+
+    class RobosuiteScene(ManipulationEnv):
+        """Pandas on their pedestals, moved at 20 Hz by robosuite's IK_POSE, shown in a window that stays open."""
+
+        def __init__(self, num_arms: int, **options: Any):
+            """`options` are those of robosuite's ManipulationEnv, for example has_renderer."""
+            defaults = dict(
+                robots=num_arms * ["Panda"],
+                controller_configs=_controller_config(),
+                initialization_noise=None,
+                control_freq=round(1 / panda.CONTROL_PERIOD),
+                use_camera_obs=False,
+                has_offscreen_renderer=False,
+                renderer="mujoco",  # which, without a window, does nothing; the other one looks for a screen all the same
+                hard_reset=False,
+                ignore_done=True,
+            )
+            super().__init__(**defaults | options)
+
+        def reward(self, action: Any = None) -> float:
+            del action
+            return float(self._check_success())
+
+        def _destroy_viewer(self) -> None:
+            # robosuite closes the window at every reset; when the model stays the same, it can stay open as well.
+            if self.hard_reset or self.sim is None:
+                super()._destroy_viewer()
+
+        def close(self) -> None:
+            super()._destroy_viewer()
+            super().close()
+
+    return RobosuiteScene
+
+
+@functools.cache
+def environment_class() -> type[Any]:
+    """`RobosuiteReach`, likewise.
+
+    Raises:
+      UserError: see `import_robosuite`.
+    """
+    base: Any = scene_class()
+    with quiet():
+        import mujoco
         from robosuite.models.arenas import EmptyArena
         from robosuite.models.tasks import ManipulationTask
         from robosuite.utils.mjcf_utils import new_site
 
-    class RobosuiteReach(ManipulationEnv):
+    class RobosuiteReach(base):
         """A robosuite environment: a Panda on its pedestal reaches waypoints in order; the reward is 1 when the last one is reached, and 0 before.
 
         Waypoints are green capsules along the hand's approach, the less opaque the later, each with a bar along which the fingers open.
@@ -48,26 +92,11 @@ def environment_class() -> type[Any]:
             self.rotations = np.tile(np.eye(3), (num_waypoints, 1, 1))
             self.position_tolerance, self.rotation_tolerance = position_tolerance, rotation_tolerance
             self.num_reached = 0
-            defaults = dict(
-                robots="Panda",
-                controller_configs=_controller_config(),
-                initialization_noise=None,
-                control_freq=round(1 / panda.CONTROL_PERIOD),
-                use_camera_obs=False,
-                has_offscreen_renderer=False,
-                renderer="mujoco",  # which, without a window, does nothing; the other one looks for a screen all the same
-                hard_reset=False,
-                ignore_done=True,
-            )
-            super().__init__(**defaults | options)
+            super().__init__(1, **options)
 
         def place(self, positions: np.ndarray, rotations: np.ndarray) -> None:
             """Sets the waypoints of the episodes to come: positions (K, 3) in m and rotation matrices (K, 3, 3), in the axes of the robot's base."""
             self.positions, self.rotations = np.asarray(positions, float), np.asarray(rotations, float)
-
-        def reward(self, action: Any = None) -> float:
-            del action
-            return float(self._check_success())
 
         def _load_model(self) -> None:
             super()._load_model()
@@ -120,15 +149,6 @@ def environment_class() -> type[Any]:
             observations = super()._get_observations(force_update)
             observations["waypoints_reached"] = (np.arange(len(self.positions)) < self.num_reached).astype(float)
             return observations
-
-        def _destroy_viewer(self) -> None:
-            # robosuite closes the window at every reset; when the model stays the same, it can stay open as well.
-            if self.hard_reset or self.sim is None:
-                super()._destroy_viewer()
-
-        def close(self) -> None:
-            super()._destroy_viewer()
-            super().close()
 
     return RobosuiteReach
 

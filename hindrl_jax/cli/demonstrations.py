@@ -40,7 +40,8 @@ class Record:
     overwrite: bool = False
     """Replace a file that is already there."""
     device: DeviceName | None = None
-    """Play yourself, instead of the expert: steer the arm of a reach task in robosuite, in real time. Give yourself a long --horizon."""
+    """Play yourself, instead of the expert: steer the arm of a reach task in robosuite, in real time, or with the keyboard those of a cable task.
+    Give yourself a long --horizon."""
 
 
 def record(arguments: list[str]) -> None:
@@ -87,9 +88,11 @@ def record(arguments: list[str]) -> None:
 def _record_by_hand(env: Any, options: Record) -> tuple[Environment, Episodes]:
     """The environment in robosuite, and what a person did there."""
     if not hasattr(env, "backend"):
-        raise UserError(f"--device {options.device} steers a robot's arm, and {env.name} has none: choose a reach environment, or drop --device")
-    if env.backend == "mjx":
-        raise UserError(f"--device {options.device} steers the arm of robosuite: drop --backend mjx, or drop --device")
+        raise UserError(
+            f"--device {options.device} steers a robot's arm, and {env.name} has none: choose a reach or a cable environment, or drop --device"
+        )
+    if env.backend not in ("closed_form", "robosuite"):
+        raise UserError(f"--device {options.device} steers the arm of robosuite: drop --backend {env.backend}, or drop --device")
     env = dataclasses.replace(env, backend="robosuite")
     return env, record_by_hand(episode_key(options.seed), env, options.device, options.demos, report=console.print)
 

@@ -61,8 +61,10 @@ TASKS: dict[str, Task] = {
         Task(FixedGridPickAndPlace, GridExpert, _GRID_VIEWER, "each of them within a small box of its own (thesis 3.1.2)"),
         Task(ParameterizedReach, ReachExpert, _REACH_VIEWER, "a Panda arm reaches random poses in order (thesis 3.2.1)", play_in_robosuite),
         Task(FixedParameterizedReach, ReachExpert, _REACH_VIEWER, "the same, with poses that never change (thesis 3.2.2)", play_in_robosuite),
-        Task(BringNear, CableExpert, _CABLE_VIEWER, "two Panda arms bring the ends of two cables together (thesis 3.2.3)"),
-        Task(CableInsertion, CableExpert, _CABLE_VIEWER, "the same arms put one cable's plug into the other's socket (thesis 3.2.4)"),
+        Task(BringNear, CableExpert, _CABLE_VIEWER, "two Panda arms bring the ends of two cables together (thesis 3.2.3)", play_in_robosuite),
+        Task(
+            CableInsertion, CableExpert, _CABLE_VIEWER, "the same arms put one cable's plug into the other's socket (thesis 3.2.4)", play_in_robosuite
+        ),
     )
 }
 

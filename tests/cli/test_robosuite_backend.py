@@ -25,7 +25,7 @@ from hindrl_jax.demonstrations.hdf5 import describe_demonstrations, load_demonst
 from hindrl_jax.envs.reach import FixedParameterizedReach
 from hindrl_jax.experts.reach import ReachExpert
 from hindrl_jax.experts.robosuite_arm import arm as arms
-from hindrl_jax.experts.robosuite_arm import installation, playing, scene, shared_arm
+from hindrl_jax.experts.robosuite_arm import installation, playing, scene, shared_scene
 from hindrl_jax.runs import writer as runs
 from hindrl_jax.runs.reader import Run, load_run
 from hindrl_jax.runs.spec import RunSpec
@@ -44,7 +44,7 @@ def arm():
     """The arm that evaluation uses as well, since building one takes seconds."""
     if importlib.util.find_spec("robosuite") is None:  # importorskip would import it, with all its side effects
         pytest.skip("robosuite is not installed")
-    return shared_arm(2)
+    return shared_scene(ENV)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_files_are_described_and_drawn_without_robosuite(tmp_path, capsys, monke
         (scene, "environment_class"),
         (arms, "environment_class"),
         (arms, "RobosuiteArm"),
-        (playing, "shared_arm"),
+        (playing, "shared_scene"),
     ):
         monkeypatch.setattr(module, name, lambda *_, name=name: pytest.fail(f"{name} was called"))
     path = tmp_path / "demos.hdf5"

@@ -202,11 +202,13 @@ def test_what_is_not_finite_stays_so_and_leaves_other_episodes_alone(backend, tm
     ("arguments", "message"),
     [
         ({"horizon": 0}, "horizon = 0 is not usable: it must be at least 1"),
-        ({"position_tolerance": 0.0}, "position_tolerance = 0.0 is not usable: it must be greater than 0"),
+        ({"position_tolerance": 0.0}, "position_tolerance = 0.0 is not usable: it must be greater than 0 and less than 0.36, .*"),
+        ({"position_tolerance": 0.4}, "position_tolerance = 0.4 is not usable: it must be greater than 0 and less than 0.36, .*"),
+        ({"joint_noise": float("inf")}, "joint_noise = inf is not usable: it must be a finite number"),
         ({"joint_noise": -0.01}, "joint_noise = -0.01 is not usable: it must be 0 or more"),
         ({"num_links": 1}, "num_links = 1 is not usable: it must be from 2 to 20"),
         ({"observation": "pixels"}, "observation = 'pixels' is not usable: it must be one of full, thesis"),
-        ({"backend": "robosuite"}, "backend = 'robosuite' is not usable: it must be one of closed_form, mujoco, mjx"),
+        ({"backend": "bullet"}, "backend = 'bullet' is not usable: it must be one of closed_form, mujoco, mjx, robosuite"),
         ({"randomised": True, "backend": "mujoco"}, "randomised = True is not usable: it must be false with backend = mujoco"),
     ],
 )
@@ -215,9 +217,10 @@ def test_invalid_arguments_say_what_is_wrong(task, arguments, message):
         task(**arguments)
 
 
-def test_an_angle_must_be_positive():
-    with pytest.raises(ValueError, match=r"rotation_tolerance = 0\.0 is not usable: it must be greater than 0"):
-        CableInsertion(rotation_tolerance=0.0)
+@pytest.mark.parametrize("angle", [0.0, 3.2])
+def test_an_angle_must_be_positive_and_less_than_a_half_turn(angle):
+    with pytest.raises(ValueError, match=rf"rotation_tolerance = {angle} is not usable: it must be greater than 0 and less than pi"):
+        CableInsertion(rotation_tolerance=angle)
 
 
 @pytest.mark.parametrize("backend", ["closed_form", "mujoco"])

@@ -7,6 +7,7 @@ import pytest
 from mujoco_twin import mujoco_at
 
 from hindrl_jax.envs import panda
+from hindrl_jax.envs.reach import FixedParameterizedReach
 
 
 @pytest.fixture(scope="module")
@@ -14,9 +15,9 @@ def theirs():
     """robosuite's compiled model of its whole scene, and data at the initial configuration with closed fingers."""
     if importlib.util.find_spec("robosuite") is None:  # importorskip would import it, with all its side effects
         pytest.skip("robosuite is not installed")
-    from hindrl_jax.experts.robosuite_arm import shared_arm
+    from hindrl_jax.experts.robosuite_arm import shared_scene
 
-    arm = shared_arm(2)
+    arm = shared_scene(FixedParameterizedReach(num_waypoints=2))
     arm.reset(np.array(panda.INITIAL_JOINTS))
     return arm.environment.sim.model._model, arm.environment.sim.data._data
 

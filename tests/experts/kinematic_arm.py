@@ -28,10 +28,8 @@ class KinematicArm:
     def __init__(self):
         self.redrawn = 0
 
-    def reset(self, joints, positions=None, rotations=None):
-        del positions, rotations
-        self.joints = self.rest = joints
-        return joints, np.zeros_like(joints)
+    def begin(self, state):
+        self.joints = self.rest = np.asarray(state.joints)
 
     def step(self, command):
         self.joints = np.asarray(self._control_step(self.joints, self.rest, command))

@@ -11,6 +11,7 @@ from kinematic_arm import KinematicArm
 
 from hindrl_jax.base.environments import action_to_env
 from hindrl_jax.base.errors import UserError
+from hindrl_jax.envs.cable import BringNear
 from hindrl_jax.envs.reach import FixedParameterizedReach
 from hindrl_jax.experts import by_hand
 from hindrl_jax.experts.by_hand import command_of, record_by_hand, record_with
@@ -171,3 +172,17 @@ def test_devices_that_are_not_there_are_refused(missing, error, message, monkeyp
     with pytest.raises(UserError, match=message) as refusal:
         devices.open_device("spacemouse", SimpleNamespace(environment=None))
     assert "\n" not in str(refusal.value)
+
+
+# --- two arms
+
+
+def test_the_arm_that_is_not_steered_stays_and_keeps_its_hand_closed():
+    device = SimpleNamespace(active_robot=1, grasp_states=[[True], [False]])
+    action = by_hand.for_both_arms(device, np.array([0.01, 0, 0, 0, 0.05, 0]))
+    np.testing.assert_allclose(action, [0, 0, 0, 0, 0, 0, 1, 0.01, 0, 0, 0, 0.05, 0, -1], atol=1e-8)
+
+
+def test_two_arms_are_steered_with_the_keyboard_alone():
+    with pytest.raises(UserError, match="spacemouse does not: use the keyboard"):
+        record_by_hand(jax.random.key(0), BringNear(backend="robosuite"), "spacemouse", 1)

@@ -17,7 +17,7 @@ from hindrl_jax.envs import panda, rotations
 from hindrl_jax.envs.panda import closed_form
 from hindrl_jax.envs.reach import FixedParameterizedReach
 from hindrl_jax.experts.reach import ReachExpert
-from hindrl_jax.experts.robosuite_arm import play_episode, play_in_robosuite, shared_arm, stacked
+from hindrl_jax.experts.robosuite_arm import play_episode, play_in_robosuite, shared_scene, stacked
 from hindrl_jax.training.playing import play
 from hindrl_jax.training.recording import record
 
@@ -36,7 +36,7 @@ def arm():
     """The arm that `play_in_robosuite` uses as well, since building one takes seconds."""
     if importlib.util.find_spec("robosuite") is None:  # importorskip would import it, with all its side effects
         pytest.skip("robosuite is not installed")
-    return shared_arm(2)
+    return shared_scene(ENV)
 
 
 # --- the motion
@@ -133,8 +133,8 @@ class Spy:
     def __init__(self, arm):
         self.arm, self.rewards, self.reached, self.commands = arm, [], [], []
 
-    def reset(self, *arguments):
-        return self.arm.reset(*arguments)
+    def begin(self, state):
+        self.arm.begin(state)
 
     def step(self, command):
         outcome = self.arm.step(command)

@@ -40,6 +40,7 @@ BEYOND = {
     "installation": {"contextlib", "importlib", "io", "logging", "os", "sys", "warnings"},
     "metaworld": {"warnings"},
     "scene": {"robosuite", "mujoco"},
+    "cable_scene": {"robosuite"},
     "arm": {"mujoco", "os", "sys"},
     "devices": {"importlib"},
     "by_hand": {"contextlib", "time"},
