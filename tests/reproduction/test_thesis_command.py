@@ -62,7 +62,10 @@ def test_it_trains_each_cell_and_reports(finished):
         "cells/quick/default/fixed-1/hindrl",
         "cells/quick/default/fixed-1/tqcfd",
     ]
-    assert sorted(path.name for path in finished.glob("*.*")) == ["cells.csv", "claims.csv", "figure-5.2-default.png", "report.md"]
+    assert sorted(path.name for path in finished.glob("*.*")) == [
+        *("cells.csv", "claims.csv", "figure-5.2-default.png"),
+        *("pairs.csv", "profiles-default.png", "report.md"),
+    ]
     assert "Finished cells: 2." in (finished / "report.md").read_text()
     assert len(list(csv.DictReader((finished / "cells.csv").read_text().splitlines()))) == 4
 
