@@ -64,7 +64,8 @@ def draw(artifact: Artifact, runs: Mapping[Setting, RecordedRun], path: Path, *,
                 axis.set_ylim(-3, 103)
             else:
                 axis.set_ylim(bottom=0)
-        drawn.suptitle(f"{artifact.title}\n{recipe}", x=0.01, ha="left", fontsize="medium")
+        shown = "" if artifact.apart or artifact.panels == ("steps_to_100",) else "; mean over seeds and its 95% bootstrap interval"
+        drawn.suptitle(f"{artifact.title}\n{recipe}{shown}", x=0.01, ha="left", fontsize="medium")
 
 
 def draw_profiles(tables: Sequence[Artifact], runs: Mapping[Setting, RecordedRun], path: Path, *, recipe: str) -> None:
@@ -83,21 +84,21 @@ def draw_profiles(tables: Sequence[Artifact], runs: Mapping[Setting, RecordedRun
     with figure(path, columns=len(tables), figsize=(1.5 + 4.5 * len(tables), 4.2), sharex=True, sharey=True) as (drawn, axes):
         for axis, table in zip(axes, tables, strict=True):
             algorithms = dict.fromkeys(setting.algo for setting in table.settings)
-            for algo, colour in zip(algorithms, colours("viridis", len(algorithms), end=0.85), strict=True):
+            for algo, colour, style in zip(algorithms, colours("viridis", len(algorithms), end=0.85), ("-", "--", ":"), strict=True):
                 groups = [runs[setting].returned_success for setting in table.settings if setting.algo == algo and setting in runs]
                 if groups:
                     shares, low, high = performance_profile(groups, thresholds)
                     label = f"{ALGORITHM_NAMES[algo]} ({sum(map(len, groups))} runs)"
-                    axis.step(100 * thresholds, shares, where="post", color=colour, linewidth=2, label=label)
+                    axis.step(100 * thresholds, shares, where="post", color=colour, linestyle=style, linewidth=2.5, label=label)
                     axis.fill_between(100 * thresholds, low, high, step="post", color=colour, alpha=0.18, linewidth=0)
             axis.set_title(table.title, loc="left", fontsize="medium")
-            axis.set(xlabel="success x of the returned policy, %", xlim=(0, 100), ylim=(-0.03, 1.03))
+            axis.set(xlabel="success x of the returned policy, %", xlim=(-1, 101), ylim=(-0.03, 1.03))
             if axis.get_legend_handles_labels()[1]:
                 axis.legend(frameon=False, fontsize="small", loc="lower left")
             else:
                 _say(axis, "not run")
         axes[0].set_ylabel("share of runs above x")
-        drawn.suptitle(f"Performance profiles\n{recipe}", x=0.01, ha="left", fontsize="medium")
+        drawn.suptitle(f"Performance profiles\n{recipe}; bands are 95% bootstrap intervals", x=0.01, ha="left", fontsize="medium")
 
 
 def steps_to_100(run: RecordedRun) -> np.ndarray:

@@ -64,7 +64,7 @@ def write(out: Path, scale: ScaleName) -> list[str]:
     judged = {claim.letter: {recipe: [judge(part, runs) for part in claim.parts] for recipe, runs in readings.items()} for claim in CLAIMS}
     with disk_trouble(out):
         out.mkdir(parents=True, exist_ok=True)
-        pictures = _draw_all(out, readings)
+        pictures = _draw_all(out, readings, scale)
         _write_csv(out / CELLS_TABLE, _CELL_COLUMNS, _cell_rows(readings, scale))
         _write_csv(out / CLAIMS_TABLE, _CLAIM_COLUMNS, _claim_rows(judged))
         _write_csv(out / PAIRS_TABLE, _PAIR_COLUMNS, _pair_rows(readings))
@@ -72,18 +72,18 @@ def write(out: Path, scale: ScaleName) -> list[str]:
     return [TEXT, CLAIMS_TABLE, PAIRS_TABLE, CELLS_TABLE, *pictures]
 
 
-def _draw_all(out: Path, readings: Readings) -> list[str]:
+def _draw_all(out: Path, readings: Readings, scale: ScaleName) -> list[str]:
     names = []
     for name, artifact in ARTIFACTS.items():
         for recipe, runs in readings.items():
             if artifact.panels and set(artifact.settings) & set(runs):
                 names.append(f"{name}-{recipe}.png")
-                draw(artifact, runs, out / names[-1], recipe=RECIPE_NAMES[recipe])
+                draw(artifact, runs, out / names[-1], recipe=f"{RECIPE_NAMES[recipe]}, scale {scale}")
     tables = [artifact for artifact in ARTIFACTS.values() if artifact.rows == "demonstrations" and not artifact.panels]
     for recipe, runs in readings.items():
         if any(set(table.settings) & set(runs) for table in tables):
             names.append(f"{PROFILES}-{recipe}.png")
-            draw_profiles(tables, runs, out / names[-1], recipe=RECIPE_NAMES[recipe])
+            draw_profiles(tables, runs, out / names[-1], recipe=f"{RECIPE_NAMES[recipe]}, scale {scale}")
     return names
 
 
@@ -99,6 +99,9 @@ Beside it, what the thesis has. An empty cell was not run.
 _OF_PAIRS = """The chance that a seed of the first cell is better than one of the second, where equal ones count half (Mann and Whitney's U),
 with its 95% interval; open where that holds 1/2, or where a cell has fewer than 4 seeds to measure. Steps of an episode are compared for those seeds
 alone whose last evaluation is at 95%; an empty entry has no seed to measure, or no environment steps.
+"""
+_OF_TIMES = """Minutes of training, all seeds of a cell side by side, evaluations included and compilation not, by the clock: where the machine had
+other work, they say how busy it was. Steps are environment steps, BC's gradient steps.
 """
 _OF_PROFILES = """The share of a table's runs, all its rows with equal weight, whose returned policies solve more than x of 100 fresh episodes. The
 higher line is better; where two lines cross, neither is.
@@ -131,7 +134,17 @@ def markdown(readings: Readings, judged: Mapping[str, Mapping[Recipe, list[Judge
     profiles = [picture for picture in pictures if picture.startswith(PROFILES)]
     if profiles:
         lines += ["### Performance profiles", "", _OF_PROFILES, *(f"![Performance profiles]({picture})\n" for picture in profiles)]
-    return lines
+    return [*lines, *_time_lines(readings)]
+
+
+def _time_lines(readings: Readings) -> list[str]:
+    """What each cell took."""
+    lines = ["## Time", "", _OF_TIMES, "| recipe | cell | seeds | steps | evaluations | minutes |", "|---|---|---|---|---|---|"]
+    for recipe, runs in readings.items():
+        for run in {run.path: run for run in runs.values()}.values():
+            cell, seeds, steps = "/".join(run.path.parts[-2:]), run.spec.seeds, run.spec.config.num_steps
+            lines.append(f"| {recipe} | {cell} | {seeds[0]}-{seeds[-1]} | {steps:,} | {len(run.success)} | {run.train_seconds / 60:.1f} |")
+    return [*lines, ""] if len(lines) > 5 else []
 
 
 def _pair_lines(readings: Readings) -> list[str]:

@@ -44,9 +44,9 @@ def test_cells_by_hand():
     # The middle half of 0, 0.4, 0.6, 1 has the mean 0.5. Two seeds reach 95%, after 10 and 20 steps, two never, so the median is never.
     assert (
         thesis_report.cell_text(recorded([[0.0, 0.4, 0.6, 1.0], [0.0, 0.9, 1.0, 1.0]], returned=[0.0, 0.4, 0.6, 1.0]))
-        == "50 [0, 100]; best 100; 2/4; >0k"
+        == "50 [0, 100]; best 100; 2/4; >0.06k"
     )
-    assert thesis_report.cell_text(recorded([[1.0]])) == "100; best 100; 1/1; 0k"  # one seed has no interval
+    assert thesis_report.cell_text(recorded([[1.0]])) == "100; best 100; 1/1; 0.01k"  # one seed has no interval
 
 
 def rows_of(text, heading, recipe):
@@ -67,7 +67,7 @@ def test_a_table_shows_the_thesis_beside_what_was_run(out):
     one, *entries = rows[3]
     assert (one, entries[0], entries[2], entries[4]) == ("1", "0%", "100%", "100%")
     # Middle halves: of 0, .1, .3, .4 and of 0, .9, 1, 1. TQCfD's seeds reach 95% after inf, 2,000, 2,000 and 1,000 steps.
-    assert re.fullmatch(r"20 \[0, 40\]; best 40; 0/4; >2k", entries[1])
+    assert re.fullmatch(r"20 \[0, 40\]; best 40; 0/4; >1.5k", entries[1])
     assert re.fullmatch(r"95 \[\d+, 100\]; best 100; 3/4; 2k", entries[3])
     assert entries[5] == "100 [100, 100]; best 100; 8/8; 1k"
     _, _, *rows = rows_of(text, "Table 5.3", "the original code")
@@ -89,6 +89,13 @@ def test_claims_are_judged_under_each_recipe(out):
     of_f = {row["recipe"]: row for row in rows if row["claim"] == "f"}
     assert (of_f["default"]["estimate"], of_f["default"]["finding"], of_f["default"]["verdict"]) == ("0.875", "holds", "holds")
     assert (of_f["original"]["estimate"], of_f["original"]["finding"]) == ("", "not run")
+
+
+def test_the_time_of_each_cell(out):
+    lines = [line for line in (out / "report.md").read_text().splitlines() if "| reach-1/" in line]
+    # TQCfD's 100 s are 1.7 minutes.
+    assert "| default | reach-1/tqcfd | 5000-5003 | 100,000 | 2 | 1.7 |" in lines
+    assert len(lines) == 4
 
 
 def test_pairs_that_claims_compare(out):
