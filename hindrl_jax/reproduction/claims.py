@@ -210,8 +210,8 @@ def settings_to_run(names: tuple[str, ...], *, recipe: Recipe, scale: ScaleName)
     return [setting for setting in settings_of(names) if setting in needed or not only_needed]
 
 
-def judge(part: Part, runs: Runs) -> Judged:
-    """A part under the recipe of these runs."""
+def judge(part: Part, runs: Runs, *, settles: bool = True) -> Judged:
+    """A part under the recipe of these runs; always open where they are too short to settle anything."""
     if not set(part.first + part.second) <= set(runs):
         return Judged(part, None, "not run")
     measure = MEASURES[part.measure]
@@ -220,7 +220,7 @@ def judge(part: Part, runs: Runs) -> Judged:
         return Judged(part, None, "open")
     interval = _estimate(part.statistic, first, second)
     too_few = bool(second) and min(map(len, first + second)) < FEWEST_SEEDS
-    return Judged(part, interval, "open" if too_few else _place(interval, part.true_between))
+    return Judged(part, interval, "open" if too_few or not settles else _place(interval, part.true_between))
 
 
 def _estimate(statistic: str, first: Sequence[np.ndarray], second: Sequence[np.ndarray]) -> Interval:

@@ -61,7 +61,10 @@ def write(out: Path, scale: ScaleName) -> list[str]:
       UserError: if a run's files cannot be read, or the report cannot be written.
     """
     readings = read(out, scale)
-    judged = {claim.letter: {recipe: [judge(part, runs) for part in claim.parts] for recipe, runs in readings.items()} for claim in CLAIMS}
+    settles = SCALES[scale].settles_claims
+    judged = {
+        claim.letter: {recipe: [judge(part, runs, settles=settles) for part in claim.parts] for recipe, runs in readings.items()} for claim in CLAIMS
+    }
     with disk_trouble(out):
         out.mkdir(parents=True, exist_ok=True)
         pictures = _draw_all(out, readings, scale)
@@ -119,7 +122,9 @@ def markdown(readings: Readings, judged: Mapping[str, Mapping[Recipe, list[Judge
     """
     number = sum(len({run.path for run in runs.values()}) for runs in readings.values())
     lines = ["# The thesis, reproduced", "", f"Scale `{scale}`: {SCALES[scale].summary} Finished cells: {number}.", ""]
-    lines += ["## Claims", "", _OF_CLAIMS, f"| claim | verdict | {' | '.join(RECIPE_NAMES.values())} |", "|---|---|---|---|---|"]
+    lines += ["## Claims", "", _OF_CLAIMS]
+    lines += [] if SCALES[scale].settles_claims else ["**Runs of this scale are too short to settle a claim: all of them are open.**", ""]
+    lines += [f"| claim | verdict | {' | '.join(RECIPE_NAMES.values())} |", "|---|---|---|---|---|"]
     lines += [_claim_line(claim, judged[claim.letter]) for claim in CLAIMS]
     lines += ["", "The parts of the claims:", ""]
     lines += [f"- ({claim.letter}) {part.what}; true if {_between(part.true_between)}" for claim in CLAIMS for part in claim.parts]

@@ -153,4 +153,5 @@ def test_a_report_of_nothing_has_no_figures(tmp_path):
     text = (tmp_path / "new" / "report.md").read_text()
     assert "Finished cells: 0." in text
     assert text.count("**open**") == 8
+    assert "too short to settle a claim" in text
     assert (tmp_path / "new" / "cells.csv").read_text().count("\n") == 1
