@@ -151,10 +151,11 @@ def _prepare(axis: Any, panel: Panel) -> None:
 
 
 def _mark(axis: Any, artifact: Artifact) -> None:
-    """The thesis's own, as broken lines; those at steps that no run has come to are out of sight, but named all the same."""
+    """The thesis's own, as broken lines; those at steps that no run has come to are out of view, and said to be."""
     end = axis.get_xlim()
     for (label, along, where), style in zip(artifact.marks, ("--", ":"), strict=False):
-        (axis.axvline if along == "x" else axis.axhline)(where, color=DEMONSTRATION, linestyle=style, linewidth=1.5, label=label)
+        shown = label if along == "y" or end[0] <= where <= end[1] else f"{label} (out of view)"
+        (axis.axvline if along == "x" else axis.axhline)(where, color=DEMONSTRATION, linestyle=style, linewidth=1.5, label=shown)
     axis.set_xlim(end)
     if axis.get_legend_handles_labels()[1]:
         axis.legend(frameon=False, fontsize="small")
