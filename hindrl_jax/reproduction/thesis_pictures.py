@@ -158,7 +158,7 @@ def _mark(axis: Any, artifact: Artifact) -> None:
         (axis.axvline if along == "x" else axis.axhline)(where, color=DEMONSTRATION, linestyle=style, linewidth=1.5, label=shown)
     axis.set_xlim(end)
     if axis.get_legend_handles_labels()[1]:
-        axis.legend(frameon=False, fontsize="small")
+        axis.legend(edgecolor="none", framealpha=0.85, fontsize="small")  # a mark may run beneath it
 
 
 def _say(axis: Any, text: str) -> None:
