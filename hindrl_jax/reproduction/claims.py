@@ -79,15 +79,13 @@ CLAIMS: tuple[Claim, ...] = (
     Claim(
         "a",
         "Behaviour cloning needs far more demonstrations",
-        (
-            Part(
-                "success of TQCfD less that of BC with five times the demonstrations or more (50, 1 and 1 against 250, 5 and 100)",
-                "difference",
-                "success",
-                _of("tqcfd", "random-50", "fixed-1", "reach-1"),
-                ABOVE_ZERO,
-                _of("bc", "random-250", "fixed-5", "reach-100"),
-            ),
+        tuple(
+            Part(f"success of TQCfD less that of BC, {what}", "difference", "success", _of("tqcfd", few), ABOVE_ZERO, _of("bc", many))
+            for what, few, many in (
+                ("of 50 against 250 demonstrations of the random grid", "random-50", "random-250"),
+                ("of 1 against 5 of the fixed grid", "fixed-1", "fixed-5"),
+                ("of 1 against 100 of reach", "reach-1", "reach-100"),
+            )
         ),
     ),
     Claim(

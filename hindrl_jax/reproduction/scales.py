@@ -8,10 +8,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from hindrl_jax.config import TrainConfig
-from hindrl_jax.core.holding import longest_hold
+from hindrl_jax.core.holding import FEWEST_DECISIONS
 from hindrl_jax.reproduction.cells import Cell, Changes, changed
 from hindrl_jax.reproduction.thesis import TASKS, Setting
 from hindrl_jax.runs.spec import RunSpec
@@ -146,8 +144,8 @@ def seconds_of(spec: RunSpec, *, cores: int) -> float:
     """About how long a cell takes, from the stated times of single steps."""
     config = spec.config
     if config.action_hold is None:
-        lengths = np.asarray([SHARE_OF_HORIZON * spec.env.horizon])
-        config = dataclasses.replace(config, action_hold=longest_hold(lengths))
+        length = int(SHARE_OF_HORIZON * spec.env.horizon)
+        config = dataclasses.replace(config, action_hold=max(1, length // FEWEST_DECISIONS))
     if config.learns_from_rollouts:
         updates, share = config.num_steps * config.num_updates / config.steps_per_iteration, 1.0
     else:

@@ -85,7 +85,7 @@ def test_claims_are_judged_under_each_recipe(out):
     assert (said, ours[:16], thesis, original) == ("**holds**", "holds: 0.88 [0.6", "", "")
     assert claims["a"][1:] == ["**open**", "", "", ""]
     rows = list(csv.DictReader((out / "claims.csv").read_text().splitlines()))
-    assert len(rows) == 3 * 11  # parts of claims under each recipe
+    assert len(rows) == 3 * 13  # parts of claims under each recipe
     of_f = {row["recipe"]: row for row in rows if row["claim"] == "f"}
     assert (of_f["default"]["estimate"], of_f["default"]["finding"], of_f["default"]["verdict"]) == ("0.875", "holds", "holds")
     assert (of_f["original"]["estimate"], of_f["original"]["finding"]) == ("", "not run")
