@@ -29,16 +29,21 @@ PAGES = {
     "benchmark-method.md": ("benchmarks/README.md", {"RESULTS.md": "benchmark-results.md"}),
     "changelog.md": ("CHANGELOG.md", {}),
     "contributing.md": ("CONTRIBUTING.md", {}),
+    "reproduction-measured.md": ("REPRODUCTION.md", {f"docs/{name}.md": f"../{name}.md" for name in ("reproduction", "differences", "results")}),
 }
 COMMANDS = "hindrl_jax/cli"
 """What stands for the command line's page in links."""
 LINK = re.compile(r"(?<!!)\[([^\]]*)\]\(([^)\s]*)\)")
+PICTURE = re.compile(r"(!\[[^\]]*\])\(([^)\s]*)\)")
 
 
 def main() -> None:
     """Writes all of them, and removes what is no longer made."""
     OUT.mkdir(exist_ok=True)
     pages: dict[str, str | bytes] = {name: page(ROOT / source, links) for name, (source, links) in PAGES.items()}
+    for source, _ in PAGES.values():
+        file = ROOT / source
+        pages |= {Path(picture).name: (file.parent / picture).read_bytes() for _, picture in PICTURE.findall(file.read_text())}
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         pages |= notebook(path)
     pages["command-line.md"] = command_line()
@@ -50,7 +55,7 @@ def main() -> None:
 
 
 def page(source: Path, links: dict[str, str]) -> str:
-    """A Markdown file of the project, with its links made to fit."""
+    """A Markdown file of the project, with its links made to fit; its pictures lie beside it."""
 
     def link(found: re.Match[str]) -> str:
         text, target = found.groups()
@@ -58,7 +63,7 @@ def page(source: Path, links: dict[str, str]) -> str:
             return found[0]
         return f"[{text}]({links[target]})" if target in links else f"{text} (`{(source.parent / target).resolve().relative_to(ROOT)}`)"
 
-    return LINK.sub(link, source.read_text())
+    return PICTURE.sub(lambda found: f"{found[1]}({Path(found[2]).name})", LINK.sub(link, source.read_text()))
 
 
 def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:

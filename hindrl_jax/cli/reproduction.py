@@ -186,7 +186,7 @@ def _train_all(to_train: Sequence[Cell], say: Callable[[Cell], str], *, weight: 
     with _bars() as progress:
         for index, cell in enumerate(to_train):
             name = f"{cell.task} {cell.name}: "
-            bar = progress.add_task(f"{name}compiling", total=cell.spec.config.num_steps, rates="")
+            bar, cpu = progress.add_task(f"{name}compiling", total=cell.spec.config.num_steps, rates=""), time.process_time()
             try:
                 cells.train(cell, report=functools.partial(_advance, progress, bar, name))
                 line = say(cell)
@@ -196,7 +196,8 @@ def _train_all(to_train: Sequence[Cell], say: Callable[[Cell], str], *, weight: 
             done += weight(cell)
             rest = to_train[index + 1 :]
             minutes = (time.perf_counter() - started) / done * sum(map(weight, rest)) / 60
-            progress.console.print(line + (f"   {len(rest)} left, about {minutes:,.0f} min" if rest else ""))
+            left = f"   {len(rest)} left, about {minutes:,.0f} min" if rest else ""
+            progress.console.print(f"{line}   {time.process_time() - cpu:,.0f} s of CPU{left}")
 
 
 def _bars() -> Progress:

@@ -98,6 +98,26 @@ def probability_of_improvement(values: np.ndarray, baseline: np.ndarray) -> np.n
     return (np.mean(values > baseline, axis=(-2, -1)) + np.mean(values >= baseline, axis=(-2, -1))) / 2.0
 
 
+def performance_profile(strata: Sequence[Sequence[float] | np.ndarray], thresholds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The share of values above each threshold, averaged over groups, and its 95% interval by the stratified bootstrap, each point for itself.
+
+    Args:
+      strata: one group of values, (S,) each, for each cell of the experiment.
+      thresholds: (N,).
+
+    Returns:
+      The share, and the lower and upper end of its interval, (N,) each. Of a group of a single value nothing is known: they are 0 and 1.
+    """
+    shares = np.stack([stats.ecdf(group).sf.evaluate(thresholds) for group in strata])
+    if min(map(len, strata)) < 2:
+        return shares.mean(axis=0), np.zeros(len(thresholds)), np.ones(len(thresholds))
+    # Of S values that are drawn anew, the number above a threshold is binomial.
+    rng, numbers = np.random.default_rng(0), np.asarray([len(group) for group in strata])[:, None]
+    drawn = np.mean(rng.binomial(numbers, shares, size=(RESAMPLES, *shares.shape)) / numbers, axis=1)
+    low, high = np.quantile(drawn, _TAILS, axis=0, method="inverted_cdf")
+    return shares.mean(axis=0), low, high
+
+
 def share(count: int, number: int) -> Interval:
     """The share count / number, with Wilson's 95% interval (Wilson, 1927), which is also of use where all or none are counted."""
     interval = stats.binomtest(count, number).proportion_ci(CONFIDENCE, method="wilson")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from hindrl_jax.config import TrainConfig
+from hindrl_jax.core.holding import FEWEST_DECISIONS
 from hindrl_jax.reproduction.cells import Cell, Changes, changed
 from hindrl_jax.reproduction.thesis import TASKS, Setting
 from hindrl_jax.runs.spec import RunSpec
@@ -16,7 +17,7 @@ from hindrl_jax.tasks.presets import original_rules, preset
 from hindrl_jax.tasks.registry import make, task
 
 Recipe = Literal["default", "thesis", "original"]
-ScaleName = Literal["quick", "laptop", "full"]
+ScaleName = Literal["quick", "short", "laptop", "full"]
 RECIPE_NAMES: dict[Recipe, str] = {"default": "our recipe", "thesis": "the thesis's text", "original": "the original code"}
 FIRST_SEED = 5_000
 """On seeds from here on, the recipe was not made."""
@@ -39,6 +40,8 @@ class Scale:
     """Changes to the thesis's and the original code's."""
     theirs_for_claims_only: bool = False
     """Whether, of these two, only the cells that a claim needs are run."""
+    settles_claims: bool = True
+    """Whether its runs are long enough to say anything of a claim."""
 
 
 SCALES: dict[ScaleName, Scale] = {
@@ -49,6 +52,15 @@ SCALES: dict[ScaleName, Scale] = {
         cloning=(("steps", 1_000), ("eval_every", 500), ("eval_episodes", 20)),
         ours=(("steps", 16_000), ("eval_every", 2_000), ("eval_episodes", 20)),
         theirs=(("steps", 5_000), ("eval_every", 1_000), ("eval_episodes", 20), ("learning_starts", 1_000), ("batch.batch_size", 256)),
+        settles_claims=False,
+    ),
+    "short": Scale(
+        "4 seeds; 40,000 environment steps of our recipe in place of 100,000, cloning in full; of the other two 50,000 in place of 300,000, with "
+        "batches of 256, and only where a claim needs the cell.",
+        seeds={"default": 4, "thesis": 4, "original": 4},
+        ours=(("steps", 40_000),),
+        theirs=(("steps", 50_000), ("batch.batch_size", 256)),
+        theirs_for_claims_only=True,
     ),
     "laptop": Scale(
         "Our recipe in full, 32 seeds on the grid and 8 on the arm. The thesis's and the original code's with batches of 512 in place of 4,096 and "
@@ -121,6 +133,8 @@ def _config(setting: Setting, recipe: Recipe, scale: ScaleName) -> TrainConfig:
     return changed(config, (*(of_scale.ours if recipe == "default" else of_scale.theirs), *weight))
 
 
+SHARE_OF_HORIZON = 0.9
+"""What a demonstration takes of its horizon, for how long a run will hold its actions, and so how many steps it will take."""
 COMPILATION, GRADIENT_STEP, BATCH_ROW, OF_CLONING = 14.0, 1.0e-3, 11e-6, 0.2
 """Seconds, of one core of an AMD EPYC: to compile a cell; of a gradient step, and of each row of its batch, rollouts and evaluations included;
 and the share of these that a step of cloning takes. What docs/performance.md and docs/earlier-results.md measured, roughly."""
@@ -129,6 +143,9 @@ and the share of these that a step of cloning takes. What docs/performance.md an
 def seconds_of(spec: RunSpec, *, cores: int) -> float:
     """About how long a cell takes, from the stated times of single steps."""
     config = spec.config
+    if config.action_hold is None:
+        length = int(SHARE_OF_HORIZON * spec.env.horizon)
+        config = dataclasses.replace(config, action_hold=max(1, length // FEWEST_DECISIONS))
     if config.learns_from_rollouts:
         updates, share = config.num_steps * config.num_updates / config.steps_per_iteration, 1.0
     else:

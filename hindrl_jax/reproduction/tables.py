@@ -102,7 +102,8 @@ def _markdown_row(outcome: Outcome) -> str:
 
 def thousands(steps: float, limit: int) -> str:
     """Steps in thousands; beyond the limit, the length of the run, if they were not enough."""
-    return f"{steps / 1000:.0f}k" if np.isfinite(steps) else f">{limit / 1000:.0f}k"
+    sign, number = ("", steps / 1000) if np.isfinite(steps) else (">", limit / 1000)
+    return f"{sign}{number:.0f}k" if number >= 10 else f"{sign}{number:.2g}k"
 
 
 def _percent(share: Interval) -> str:

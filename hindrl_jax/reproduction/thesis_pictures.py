@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hindrl_jax.plotting.figures import DEMONSTRATION, MEAN, SEED, band, colours, figure, mean_line
+from hindrl_jax.plotting.statistics import performance_profile
 from hindrl_jax.reproduction.measures import HINDSIGHT_REWARD
-from hindrl_jax.reproduction.thesis import Artifact, Setting
+from hindrl_jax.reproduction.thesis import ALGORITHM_NAMES, Artifact, Setting
 from hindrl_jax.runs.recorded import RecordedRun
 
 
@@ -63,7 +64,41 @@ def draw(artifact: Artifact, runs: Mapping[Setting, RecordedRun], path: Path, *,
                 axis.set_ylim(-3, 103)
             else:
                 axis.set_ylim(bottom=0)
-        drawn.suptitle(f"{artifact.title}\n{recipe}", x=0.01, ha="left", fontsize="medium")
+        shown = "" if artifact.apart or artifact.panels == ("steps_to_100",) else "; mean over seeds and its 95% bootstrap interval"
+        drawn.suptitle(f"{artifact.title}\n{recipe}{shown}", x=0.01, ha="left", fontsize="medium")
+
+
+def draw_profiles(tables: Sequence[Artifact], runs: Mapping[Setting, RecordedRun], path: Path, *, recipe: str) -> None:
+    """Draws the performance profiles of tables as a PNG: a line for each algorithm, of all its cells that are there, with 95% intervals.
+
+    Args:
+      tables: a panel each.
+      runs: those of their settings that are finished.
+      path: the file.
+      recipe: what they were trained with, for people.
+
+    Raises:
+      OSError: if it cannot be written.
+    """
+    thresholds = np.linspace(0.0, 1.0, 101)
+    with figure(path, columns=len(tables), figsize=(1.5 + 4.5 * len(tables), 4.2), sharex=True, sharey=True) as (drawn, axes):
+        for axis, table in zip(axes, tables, strict=True):
+            algorithms = dict.fromkeys(setting.algo for setting in table.settings)
+            for algo, colour, style in zip(algorithms, colours("viridis", len(algorithms), end=0.85), ("-", "--", ":"), strict=True):
+                groups = [runs[setting].returned_success for setting in table.settings if setting.algo == algo and setting in runs]
+                if groups:
+                    shares, low, high = performance_profile(groups, thresholds)
+                    label = f"{ALGORITHM_NAMES[algo]} ({sum(map(len, groups))} runs)"
+                    axis.step(100 * thresholds, shares, where="post", color=colour, linestyle=style, linewidth=2.5, label=label)
+                    axis.fill_between(100 * thresholds, low, high, step="post", color=colour, alpha=0.18, linewidth=0)
+            axis.set_title(table.title, loc="left", fontsize="medium")
+            axis.set(xlabel="success x of the returned policy, %", xlim=(-1, 101), ylim=(-0.03, 1.03))
+            if axis.get_legend_handles_labels()[1]:
+                axis.legend(frameon=False, fontsize="small", loc="lower left")
+            else:
+                _say(axis, "not run")
+        axes[0].set_ylabel("share of runs above x")
+        drawn.suptitle(f"Performance profiles\n{recipe}; bands are 95% bootstrap intervals", x=0.01, ha="left", fontsize="medium")
 
 
 def steps_to_100(run: RecordedRun) -> np.ndarray:
@@ -116,13 +151,14 @@ def _prepare(axis: Any, panel: Panel) -> None:
 
 
 def _mark(axis: Any, artifact: Artifact) -> None:
-    """The thesis's own, as broken lines; those at steps that no run has come to are out of sight, but named all the same."""
+    """The thesis's own, as broken lines; those at steps that no run has come to are out of view, and said to be."""
     end = axis.get_xlim()
     for (label, along, where), style in zip(artifact.marks, ("--", ":"), strict=False):
-        (axis.axvline if along == "x" else axis.axhline)(where, color=DEMONSTRATION, linestyle=style, linewidth=1.5, label=label)
+        shown = label if along == "y" or end[0] <= where <= end[1] else f"{label} (out of view)"
+        (axis.axvline if along == "x" else axis.axhline)(where, color=DEMONSTRATION, linestyle=style, linewidth=1.5, label=shown)
     axis.set_xlim(end)
     if axis.get_legend_handles_labels()[1]:
-        axis.legend(frameon=False, fontsize="small")
+        axis.legend(edgecolor="none", framealpha=0.85, fontsize="small")  # a mark may run beneath it
 
 
 def _say(axis: Any, text: str) -> None:

@@ -2,7 +2,9 @@
 
     OUT/report.md           for people: the verdict of each claim, and each table and figure beside the thesis's
     OUT/claims.csv          a row for each part of a claim and each recipe
+    OUT/pairs.csv           a row for each pair of cells that a claim compares, each measure and each recipe
     OUT/cells.csv           a row for each seed of each finished cell
+    OUT/profiles-RECIPE.png the performance profiles of the three tables
     OUT/figure-5.1-RECIPE.png, ...
     OUT/cells/SCALE/RECIPE/TASK/NAME/    the runs
 
@@ -24,15 +26,18 @@ from hindrl_jax.plotting.statistics import Interval, interquartile_mean, stratif
 from hindrl_jax.reproduction import measures
 from hindrl_jax.reproduction.cells import is_finished
 from hindrl_jax.reproduction.claims import CLAIMS, Claim, Judged, Runs, finding_of, judge, verdict
+from hindrl_jax.reproduction.comparisons import IN_WORDS, Compared, compare, pairs
 from hindrl_jax.reproduction.scales import RECIPE_NAMES, SCALES, Recipe, ScaleName, cells_of
 from hindrl_jax.reproduction.tables import thousands
 from hindrl_jax.reproduction.thesis import ALGORITHM_NAMES, ARTIFACTS, TASKS, Artifact, Setting, settings_of
-from hindrl_jax.reproduction.thesis_pictures import draw
+from hindrl_jax.reproduction.thesis_pictures import draw, draw_profiles
 from hindrl_jax.runs.recorded import RecordedRun, read_recorded
 
-TEXT, CLAIMS_TABLE, CELLS_TABLE = "report.md", "claims.csv", "cells.csv"
+TEXT, CLAIMS_TABLE, PAIRS_TABLE, CELLS_TABLE = "report.md", "claims.csv", "pairs.csv", "cells.csv"
 Readings = Mapping[Recipe, Runs]
 """The finished runs of each recipe."""
+PROFILES = "profiles"
+"""What the names of their pictures begin with."""
 
 
 def read(out: Path, scale: ScaleName) -> Readings:
@@ -56,23 +61,32 @@ def write(out: Path, scale: ScaleName) -> list[str]:
       UserError: if a run's files cannot be read, or the report cannot be written.
     """
     readings = read(out, scale)
-    judged = {claim.letter: {recipe: [judge(part, runs) for part in claim.parts] for recipe, runs in readings.items()} for claim in CLAIMS}
+    settles = SCALES[scale].settles_claims
+    judged = {
+        claim.letter: {recipe: [judge(part, runs, settles=settles) for part in claim.parts] for recipe, runs in readings.items()} for claim in CLAIMS
+    }
     with disk_trouble(out):
         out.mkdir(parents=True, exist_ok=True)
-        pictures = _draw_all(out, readings)
+        pictures = _draw_all(out, readings, scale)
         _write_csv(out / CELLS_TABLE, _CELL_COLUMNS, _cell_rows(readings, scale))
         _write_csv(out / CLAIMS_TABLE, _CLAIM_COLUMNS, _claim_rows(judged))
+        _write_csv(out / PAIRS_TABLE, _PAIR_COLUMNS, _pair_rows(readings))
         (out / TEXT).write_text("\n".join(markdown(readings, judged, scale=scale, pictures=pictures)) + "\n")
-    return [TEXT, CLAIMS_TABLE, CELLS_TABLE, *pictures]
+    return [TEXT, CLAIMS_TABLE, PAIRS_TABLE, CELLS_TABLE, *pictures]
 
 
-def _draw_all(out: Path, readings: Readings) -> list[str]:
+def _draw_all(out: Path, readings: Readings, scale: ScaleName) -> list[str]:
     names = []
     for name, artifact in ARTIFACTS.items():
         for recipe, runs in readings.items():
             if artifact.panels and set(artifact.settings) & set(runs):
                 names.append(f"{name}-{recipe}.png")
-                draw(artifact, runs, out / names[-1], recipe=RECIPE_NAMES[recipe])
+                draw(artifact, runs, out / names[-1], recipe=f"{RECIPE_NAMES[recipe]}, scale {scale}")
+    tables = [artifact for artifact in ARTIFACTS.values() if artifact.rows == "demonstrations" and not artifact.panels]
+    for recipe, runs in readings.items():
+        if any(set(table.settings) & set(runs) for table in tables):
+            names.append(f"{PROFILES}-{recipe}.png")
+            draw_profiles(tables, runs, out / names[-1], recipe=f"{RECIPE_NAMES[recipe]}, scale {scale}")
     return names
 
 
@@ -84,6 +98,16 @@ narrow.
 _OF_TABLES = """Each cell: success of the returned policies in 100 fresh episodes, interquartile mean over seeds and its 95% bootstrap interval, in %;
 that of the best seed; seeds of which an evaluation along the run reached 95%; environment steps (BC: gradient steps) to it, median over all seeds.
 Beside it, what the thesis has. An empty cell was not run.
+"""
+_OF_PAIRS = """The chance that a seed of the first cell is better than one of the second, where equal ones count half (Mann and Whitney's U),
+with its 95% interval; open where that holds 1/2, or where a cell has fewer than 4 seeds to measure. Steps of an episode are compared for those seeds
+alone whose last evaluation is at 95%; an empty entry has no seed to measure, or no environment steps.
+"""
+_OF_TIMES = """Minutes of training, all seeds of a cell side by side, evaluations included and compilation not, by the clock: where the machine had
+other work, they say how busy it was. Steps are environment steps, BC's gradient steps.
+"""
+_OF_PROFILES = """The share of a table's runs, all its rows with equal weight, whose returned policies solve more than x of 100 fresh episodes. The
+higher line is better; where two lines cross, neither is.
 """
 
 
@@ -98,11 +122,13 @@ def markdown(readings: Readings, judged: Mapping[str, Mapping[Recipe, list[Judge
     """
     number = sum(len({run.path for run in runs.values()}) for runs in readings.values())
     lines = ["# The thesis, reproduced", "", f"Scale `{scale}`: {SCALES[scale].summary} Finished cells: {number}.", ""]
-    lines += ["## Claims", "", _OF_CLAIMS, f"| claim | verdict | {' | '.join(RECIPE_NAMES.values())} |", "|---|---|---|---|---|"]
+    lines += ["## Claims", "", _OF_CLAIMS]
+    lines += [] if SCALES[scale].settles_claims else ["**Runs of this scale are too short to settle a claim: all of them are open.**", ""]
+    lines += [f"| claim | verdict | {' | '.join(RECIPE_NAMES.values())} |", "|---|---|---|---|---|"]
     lines += [_claim_line(claim, judged[claim.letter]) for claim in CLAIMS]
     lines += ["", "The parts of the claims:", ""]
     lines += [f"- ({claim.letter}) {part.what}; true if {_between(part.true_between)}" for claim in CLAIMS for part in claim.parts]
-    lines += ["", "## Tables and figures", "", _OF_TABLES]
+    lines += ["", *_pair_lines(readings), "## Tables and figures", "", _OF_TABLES]
     for name, artifact in ARTIFACTS.items():
         there = {recipe: runs for recipe, runs in readings.items() if set(artifact.settings) & set(runs)}
         if there:
@@ -110,7 +136,39 @@ def markdown(readings: Readings, judged: Mapping[str, Mapping[Recipe, list[Judge
             lines += [artifact.remark, ""] if artifact.remark else []
             lines += [line for recipe, runs in there.items() if not artifact.panels for line in _table(artifact, runs, RECIPE_NAMES[recipe])]
             lines += [f"![{artifact.title}]({picture})\n" for picture in pictures if picture.startswith(f"{name}-")]
-    return lines
+    profiles = [picture for picture in pictures if picture.startswith(PROFILES)]
+    if profiles:
+        lines += ["### Performance profiles", "", _OF_PROFILES, *(f"![Performance profiles]({picture})\n" for picture in profiles)]
+    return [*lines, *_time_lines(readings)]
+
+
+def _time_lines(readings: Readings) -> list[str]:
+    """What each cell took."""
+    lines = ["## Time", "", _OF_TIMES, "| recipe | cell | seeds | steps | evaluations | minutes |", "|---|---|---|---|---|---|"]
+    for recipe, runs in readings.items():
+        for run in {run.path: run for run in runs.values()}.values():
+            cell, seeds, steps = "/".join(run.path.parts[-2:]), run.spec.seeds, run.spec.config.num_steps
+            lines.append(f"| {recipe} | {cell} | {seeds[0]}-{seeds[-1]} | {steps:,} | {len(run.success)} | {run.train_seconds / 60:.1f} |")
+    return [*lines, ""] if len(lines) > 5 else []
+
+
+def _pair_lines(readings: Readings) -> list[str]:
+    """A table for each recipe that has a pair."""
+    lines = []
+    for recipe, runs in readings.items():
+        rows = [(pair, {one.measure: one for one in compare(pair, runs)}) for pair in pairs()]
+        rows = [(pair, found) for pair, found in rows if found]
+        if rows:
+            lines += [f"With {RECIPE_NAMES[recipe]}:", "", f"| pair | claims | {' | '.join(IN_WORDS.values())} |", "|---|---|---|---|---|"]
+            lines += [f"| {pair.title()} | {pair.claims} | {' | '.join(_said(found.get(name)) for name in IN_WORDS)} |" for pair, found in rows]
+            lines.append("")
+    return ["## Pairs that claims compare", "", _OF_PAIRS, *lines] if lines else []
+
+
+def _said(compared: Compared | None) -> str:
+    if compared is None:
+        return ""
+    return f"{'open' if compared.said == 'open' else f'the {compared.said}'}: {_short(compared.chance)}"
 
 
 def _claim_line(claim: Claim, judged: Mapping[Recipe, list[Judged]]) -> str:
@@ -195,6 +253,19 @@ def _claim_rows(judged: Mapping[str, Mapping[Recipe, list[Judged]]]) -> list[dic
             for one in of_recipe:
                 numbers = ("", "", "") if one.interval is None else tuple(f"{number:.6g}" for number in dataclasses.astuple(one.interval))
                 rows.append(dict(zip(_CLAIM_COLUMNS, (letter, one.part.what, recipe, *numbers, one.finding, said), strict=True)))
+    return rows
+
+
+_PAIR_COLUMNS = ("claims", "first", "second", "measure", "recipe", "chance", "low", "high", "better")
+
+
+def _pair_rows(readings: Readings) -> list[dict[str, Any]]:
+    found = [(recipe, one) for pair in pairs() for recipe, runs in readings.items() for one in compare(pair, runs)]
+    rows = []
+    for recipe, one in found:
+        names = (f"{setting.task} {setting.algo}" for setting in (one.pair.first, one.pair.second))
+        numbers = (f"{number:.6g}" for number in dataclasses.astuple(one.chance))
+        rows.append(dict(zip(_PAIR_COLUMNS, (one.pair.claims, *names, one.measure, recipe, *numbers, one.said), strict=True)))
     return rows
 
 

@@ -10,6 +10,7 @@ from hindrl_jax.plotting.statistics import (
     bootstrap_band,
     bootstrap_difference,
     interquartile_mean,
+    performance_profile,
     probability_of_improvement,
     share,
     stratified_bootstrap,
@@ -77,6 +78,29 @@ def test_probability_of_improvement_is_mann_and_whitneys():
     rng = np.random.default_rng(3)
     values, baseline = rng.integers(6, size=9), rng.integers(6, size=7)
     assert probability_of_improvement(values, baseline) == pytest.approx(stats.mannwhitneyu(values, baseline).statistic / (9 * 7))
+
+
+def test_performance_profiles_by_hand():
+    # Above 0, 0.4 and 1 lie 3, 2 and 0 of the first group's four values and none of the second's two: averaged over groups 3/8, 1/4 and 0.
+    shares, low, high = performance_profile([[0.0, 0.2, 0.6, 1.0], [0.0, 0.0]], np.array([0.0, 0.4, 1.0]))
+    np.testing.assert_allclose(shares, [0.375, 0.25, 0.0])
+    # 4 values drawn anew, each above 0.4 with chance 1/2: none with chance 1/16 and all with 1/16, more than 2.5% at each end; halved by the average.
+    np.testing.assert_allclose([low[1], high[1], high[2]], [0.0, 0.5, 0.0])
+    assert performance_profile([[0.5], [0.5, 0.7]], np.array([0.1]))[1:] == (0.0, 1.0)
+
+
+def test_performance_profiles_are_bootstrapped_within_groups():
+    rng, thresholds = np.random.default_rng(5), np.array([0.3, 0.7])
+    groups = [rng.random(12), rng.random(9) / 2]
+    shares, low, high = performance_profile(groups, thresholds)
+    for index, threshold in enumerate(thresholds):
+
+        def above(drawn, threshold=threshold):
+            return np.mean([np.mean(group > threshold, axis=-1) for group in drawn], axis=0)
+
+        whole = stratified_bootstrap(groups, above)
+        assert shares[index] == pytest.approx(whole.estimate)
+        np.testing.assert_allclose([low[index], high[index]], [whole.low, whole.high], atol=0.05)  # one value of twelve, halved, is 0.04
 
 
 def test_shares_by_hand():

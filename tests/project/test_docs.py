@@ -31,7 +31,7 @@ def site(tmp_path_factory):
     ignored = shutil.ignore_patterns("generated", "__pycache__")
     for name in ("docs", "notebooks", "benchmarks", "examples"):
         shutil.copytree(ROOT / name, folder / name, ignore=ignored)
-    for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "mkdocs.yml"):
+    for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "REPRODUCTION.md", "mkdocs.yml"):
         shutil.copy(ROOT / name, folder)
     (folder / "hindrl_jax").symlink_to(ROOT / "hindrl_jax")
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1", "JAX_PLATFORMS": "cpu"}
@@ -111,7 +111,7 @@ def test_every_module_has_a_page():
 
 def test_links_lead_to_files_of_the_project():
     """As the pages stand, in a checkout: to what is made for the site alone, no page links."""
-    pages = (README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *PAGES)
+    pages = (README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", ROOT / "REPRODUCTION.md", *PAGES)
     links = {(path, target) for path in pages for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", path.read_text()) if "://" not in target}
     assert len(links) > 100
     missing = [f"{path.name}: {target}" for path, target in links if not (path.parent / target).exists()]

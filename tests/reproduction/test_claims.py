@@ -1,5 +1,6 @@
 """Measures, parts, claims and verdicts, of runs whose figures are made up."""
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -69,6 +70,11 @@ def test_what_was_not_run_or_cannot_be_measured_is_not_judged():
     lengths = {"episode_length": [[30.0] * 8] * 2}
     assert judge(part, {A: recorded(CONVERGED, **lengths)}) == Judged(part, None, "not run")
     assert judge(part, {A: recorded(CONVERGED, **lengths), B: recorded(FAILED, **lengths)}) == Judged(part, None, "open")  # nobody of B converged
+
+
+def test_runs_that_are_too_short_settle_nothing():
+    part = Part("", "share", "converged", (A,), MORE_THAN_HALF)
+    assert judge(part, {A: recorded(CONVERGED)}, settles=False) == dataclasses.replace(judge(part, {A: recorded(CONVERGED)}), finding="open")
 
 
 def test_differences_are_averaged_over_pairs_of_interquartile_means():

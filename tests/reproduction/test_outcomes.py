@@ -94,11 +94,11 @@ def test_markdown_by_hand(by_hand):
         "",
         "| change | 95% | steps to 95% | returned | along | difference | s/seed | cost |",
         "|---|---|---|---|---|---|---|---|",
-        "| default | 1/2 | >0k [0k, >0k] | 95.0 [90.0, 100.0] | 32.0 [24.0, 40.0] |  | 5.0 | 1.00 |",
+        "| default | 1/2 | >0.08k [0.08k, >0.08k] | 95.0 [90.0, 100.0] | 32.0 [24.0, 40.0] |  | 5.0 | 1.00 |",
         "| *targets* | | | | | | | |",
-        "| worse | 0/2 | >0k [>0k, >0k] | 50.0 [50.0, 50.0] | 7.0 [4.0, 10.0] | **-25.0 [-30.0, -20.0]** | 15.0 | 3.00 |",
+        "| worse | 0/2 | >0.08k [>0.08k, >0.08k] | 50.0 [50.0, 50.0] | 7.0 [4.0, 10.0] | **-25.0 [-30.0, -20.0]** | 15.0 | 3.00 |",
         "| *critic* | | | | | | | |",
-        "| better | 2/2 | 0k [0k, 0k] | 100.0 [100.0, 100.0] | 74.0 [73.0, 75.0] | **+42.0 [+33.0, +51.0]** | 2.5 | 0.50 |",
+        "| better | 2/2 | 0.04k [0.04k, 0.04k] | 100.0 [100.0, 100.0] | 74.0 [73.0, 75.0] | **+42.0 [+33.0, +51.0]** | 2.5 | 0.50 |",
         "",
     ]
 
@@ -118,6 +118,6 @@ def test_the_picture_has_a_panel_for_each_task(by_hand, tmp_path):
     assert widths[1] > 1.4 * widths[0]
 
 
-@pytest.mark.parametrize(("steps", "said"), [(62_400.0, "62k"), (np.inf, ">300k")])
+@pytest.mark.parametrize(("steps", "said"), [(62_400.0, "62k"), (9_400.0, "9.4k"), (500.0, "0.5k"), (np.inf, ">300k")])
 def test_steps_that_were_not_enough_are_said_to_be_more(steps, said):
     assert thousands(steps, 300_000) == said

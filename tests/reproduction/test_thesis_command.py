@@ -62,7 +62,10 @@ def test_it_trains_each_cell_and_reports(finished):
         "cells/quick/default/fixed-1/hindrl",
         "cells/quick/default/fixed-1/tqcfd",
     ]
-    assert sorted(path.name for path in finished.glob("*.*")) == ["cells.csv", "claims.csv", "figure-5.2-default.png", "report.md"]
+    assert sorted(path.name for path in finished.glob("*.*")) == [
+        *("cells.csv", "claims.csv", "figure-5.2-default.png"),
+        *("pairs.csv", "profiles-default.png", "report.md"),
+    ]
     assert "Finished cells: 2." in (finished / "report.md").read_text()
     assert len(list(csv.DictReader((finished / "cells.csv").read_text().splitlines()))) == 4
 
@@ -140,7 +143,8 @@ def test_a_cell_that_diverges_is_left_out_and_the_others_are_trained(tmp_path, c
     monkeypatch.setattr(cells, "train", train)
     run(tmp_path)
     printed = capsys.readouterr().out
-    assert "fixed-1 tqcfd: left out: critic/loss of seed 5000 is nan   1 left" in printed
+    assert "fixed-1 tqcfd: left out: critic/loss of seed 5000 is nan   " in printed
+    assert "s of CPU   1 left" in printed
     assert "Finished cells: 1." in (tmp_path / "report.md").read_text()
 
 
