@@ -70,8 +70,6 @@ class AgentConfig:
     input_encoding: Literal["raw", "multiscale", "standardised"] = "multiscale"
     """Networks see inputs as they are (thesis); or less their mean in the demonstrations, over their standard deviation; or (multiscale) that and
     tanh(4 x), x being the input over its root mean square there."""
-    goal_difference: bool = False
-    """Networks also see the desired goal less the achieved one, in the same encoding: what is left to do, where goals differ between episodes."""
 
     def __post_init__(self) -> None:
         check_types(self)

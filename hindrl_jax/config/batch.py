@@ -31,9 +31,6 @@ class BatchConfig:
     """For joint_union: the share of relabelled goals that comes from the demonstrations."""
     intersection_goals: Literal["rollout", "demonstrations"] = "rollout"
     """For joint_intersection: goals that the rollout reached within epsilon of a demonstrated one, or the demonstrated ones that it came near."""
-    relabel_demonstrations: bool = False
-    """Relabel demonstration rows, too, the same share of them, each with a goal that its own demonstration reaches later, as if it had been recorded
-    for that goal; also for cloning (Ding et al., goal-conditioned imitation learning, 2019)."""
     n_step: int = 5
     """Steps of reward before the value estimate takes over."""
     gamma: float = 0.98

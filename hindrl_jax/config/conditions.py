@@ -34,23 +34,13 @@ def _has_a_network_of_ours(config: TrainConfig) -> bool:
 
 CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
     (
-        "max_demo_ratio reach_zero hindrl_sampling_strategy union_sampling_ratio intersection_goals "
+        "max_demo_ratio reach_zero relabelled_per_original hindrl_sampling_strategy union_sampling_ratio intersection_goals "
         "n_step gamma bootstrap_past_relabelled_goals timeouts_are_terminal "
         "achieved_goal_ratio clip_targets num_critics num_target_critics num_quantiles top_quantiles_to_drop_per_net "
         "layer_norm target_update_rate initial_alpha relative_value target_entropy final_target_entropy bc_weight agent_resets num_envs "
         "updates_per_iteration learning_starts buffer_size demo_reset_ratio demo_reset_curriculum critic_network actor_loss critic_loss",
         lambda c: c.learns_from_rollouts,
         "behaviour cloning does not use it: choose another algo",
-    ),
-    (
-        "relabelled_per_original",
-        lambda c: c.learns_from_rollouts or c.batch.relabel_demonstrations,
-        "behaviour cloning uses it only for demonstrations: add --relabel-demonstrations, or choose another algo",
-    ),
-    (
-        "relabel_demonstrations",
-        lambda c: c.batch.relabelled_per_original > 0 and (_has_demo_rows(c) or c.clones_first),
-        "nothing of the demonstrations would be relabelled: choose --algo hindrl or bc, --relabelled-per-original and --max-demo-ratio above 0",
     ),
     ("num_quantiles top_quantiles_to_drop_per_net", lambda c: c.agent.base == "tqc", "{base} has no quantiles: choose --base tqc"),
     ("net_arch residual", _has_a_network_of_ours, "networks of your own are as large as they say: drop it"),

@@ -13,13 +13,13 @@ import jax
 import jax.numpy as jnp
 
 from hindrl_jax.base.environments import Environment, RelabelsObservations
-from hindrl_jax.base.types import Array, Transition, tree_where
+from hindrl_jax.base.types import Array, Episodes, Transition, tree_where
 from hindrl_jax.config import BatchConfig, TrainConfig
 from hindrl_jax.core.goals import GoalTest
 from hindrl_jax.core.guidance import Guidance
-from hindrl_jax.core.hindsight import goal_source, hindsight_steps
+from hindrl_jax.core.hindsight import goal_source
 from hindrl_jax.core.randomness import uniform_index
-from hindrl_jax.core.relabel import num_relabelled, relabel, relabel_observations, reward_by_goal, with_goals_of
+from hindrl_jax.core.relabel import num_relabelled, relabel, relabel_observations, reward_by_goal
 from hindrl_jax.core.replay import ReplayState, sample_episodes, sample_steps
 from hindrl_jax.core.steps import read_steps, transitions
 
@@ -53,7 +53,7 @@ def sample_batch(key: Array, replay: ReplayState, guidance: Guidance, env_steps:
     Args:
       key: random key.
       replay: at least one complete episode.
-      guidance: its demonstrations are drawn uniformly by episode, then by step, and relabelled only with `relabel_demonstrations`.
+      guidance: its demonstrations are drawn uniformly by episode, then by step, and never relabelled.
       env_steps: () int32, environment steps so far.
       env: says what goals are; see `rows_of_replay`.
       config: batch size, shares, strategy, n-step.
@@ -73,8 +73,7 @@ def sample_batch(key: Array, replay: ReplayState, guidance: Guidance, env_steps:
         return batch
 
     demo = uniform_index(key_demo, (max_demo_rows,), demonstrations.lengths.shape[0])
-    chosen = demo, sample_steps(key_demo_step, demonstrations, demo)
-    demo_batch = rows_of_demonstrations(jax.random.fold_in(key_demo, 1), chosen, guidance, env, config)
+    demo_batch = rows_of_demonstrations(demonstrations, demo, sample_steps(key_demo_step, demonstrations, demo), env, config)
     head = jax.tree.map(lambda leaf: leaf[:max_demo_rows], batch)
     head = tree_where(index[:max_demo_rows] < demo_rows, demo_batch, head)
     return jax.tree.map(lambda leaf, first: leaf.at[:max_demo_rows].set(first), batch, head)
@@ -95,31 +94,17 @@ def rows_of_replay(key: Array, replay: ReplayState, rows: Rows, guidance: Guidan
     return transitions(steps, env.achieved_goal, config, is_demonstration=False)
 
 
-def rows_of_demonstrations(key: Array, chosen: tuple[Array, Array], guidance: Guidance, env: Environment, config: TrainConfig) -> Transition:
-    """Reads rows of the demonstrations, and with `relabel_demonstrations` relabels the first of them.
-
-    Args:
-      key: random key, for goals.
-      chosen: episodes and steps, (B,) int32.
-      guidance: the demonstrations, and when a goal counts as reached.
-      env, config: static.
-    """
-    demonstrations, (rows, steps) = guidance.demonstrations, chosen
-    read = read_steps(demonstrations, rows, steps, config.batch.n_step)
-    if config.batch.relabel_demonstrations and config.batch.relabelled_per_original > 0:
-        later = hindsight_steps(key, steps, demonstrations.lengths[rows], source="future")
-        relabelled = jnp.arange(rows.shape[0]) < num_relabelled(jnp.asarray(rows.shape[0]), config.batch.relabelled_per_original)
-        read = with_goals_of(demonstrations.observations[rows, later], read, relabelled, goal_test(guidance, env, config))
-    return transitions(read, env.achieved_goal, config, is_demonstration=True)
+def rows_of_demonstrations(demonstrations: Episodes, rows: Array, steps: Array, env: Environment, config: TrainConfig) -> Transition:
+    """Reads rows of the demonstrations, which are never relabelled: rows and steps (B,) int32 -> the batch."""
+    recorded = read_steps(demonstrations, rows, steps, config.batch.n_step)
+    return transitions(recorded, env.achieved_goal, config, is_demonstration=True)
 
 
-def sample_demonstrations(key: Array, guidance: Guidance, env: Environment, config: TrainConfig) -> Transition:
+def sample_demonstrations(key: Array, demonstrations: Episodes, env: Environment, config: TrainConfig) -> Transition:
     """A batch of demonstration rows alone."""
-    demonstrations = guidance.demonstrations
     key_demo, key_step = jax.random.split(key)
     rows = uniform_index(key_demo, (config.batch.batch_size,), demonstrations.lengths.shape[0])
-    chosen = rows, sample_steps(key_step, demonstrations, rows)
-    return rows_of_demonstrations(jax.random.fold_in(key_demo, 1), chosen, guidance, env, config)
+    return rows_of_demonstrations(demonstrations, rows, sample_steps(key_step, demonstrations, rows), env, config)
 
 
 def goal_test(guidance: Guidance, env: Environment, config: TrainConfig) -> GoalTest:

@@ -75,13 +75,11 @@ def network_inputs(observation: Array, achieved_goal: Array, desired_goal: Array
     The multiscale encoding gives each dimension twice: standardised, for where in the task it is; and saturating around 0 in units of its root mean
     square, so that where a dimension is a distance, "exactly there" and "one step off" are far apart. Small networks blur the two else.
     """
-    difference = []
-    if config.agent.goal_difference:
-        difference = [_encode(desired_goal - achieved_goal, jnp.zeros_like(scale.goal), scale.goal, config.agent)]
     observation, achieved_goal, desired_goal = (
         _encode(observation, scale.observation_centre, scale.observation, config.agent),
         _encode(achieved_goal, scale.goal_centre, scale.goal, config.agent),
         _encode(desired_goal, scale.goal_centre, scale.goal, config.agent),
     )
-    parts = [achieved_goal, desired_goal, observation] if config.quirks.achieved_goal_input else [observation, desired_goal]
-    return jnp.concatenate([*parts, *difference], axis=-1)
+    if config.quirks.achieved_goal_input:
+        return jnp.concatenate([achieved_goal, desired_goal, observation], axis=-1)
+    return jnp.concatenate([observation, desired_goal], axis=-1)

@@ -29,6 +29,8 @@ def num_relabelled(num_replay_rows: Array, relabelled_per_original: float) -> Ar
 def relabel(key: Array, replay: ReplayState, steps: Steps, chosen: Array, source: GoalSource, test: GoalTest) -> Steps:
     """Gives rows another goal, and the rewards of reaching it.
 
+    Where episodes have goals of their own, one that ended because its goal was reached goes on for another goal: its last state is not worth nothing.
+
     Args:
       key: random key.
       replay: where the rows come from, and the source may look for goals.
@@ -38,14 +40,7 @@ def relabel(key: Array, replay: ReplayState, steps: Steps, chosen: Array, source
       test: when a goal counts as reached.
     """
     observations, found = source(key, replay, steps.row, steps.step)
-    return with_goals_of(observations, steps, chosen & found, test)
-
-
-def with_goals_of(observations: Array, steps: Steps, chosen: Array, test: GoalTest) -> Steps:
-    """Gives chosen rows (B,) the goals that states (B, D) achieve, and the rewards of reaching them.
-
-    Where episodes have goals of their own, one that ended because its goal was reached goes on for another goal: its last state is not worth nothing.
-    """
+    chosen = chosen & found
     if test.own_goals:
         solved = jnp.any(steps.is_last & (steps.rewards > 0.0), axis=1)
         steps = steps.replace(terminated=steps.terminated & ~(chosen & solved))

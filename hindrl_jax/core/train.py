@@ -259,7 +259,7 @@ def clone(state: TrainState, guidance: Guidance, *, env: Environment, config: Tr
 
     def gradient_step(state: TrainState, _: None) -> tuple[TrainState, Metrics]:
         key, key_batch, key_update = jax.random.split(state.key, 3)
-        batch = sample_demonstrations(key_batch, guidance, env, config)
+        batch = sample_demonstrations(key_batch, guidance.demonstrations, env, config)
         moment = schedule(0.0, state.updates, config.agent, action_dim=env.action_dim)
         agent, metrics = agents.update_bc(key_update, state.agent, batch, moment, config)
         return state.replace(agent=agent, key=key, updates=state.updates + 1), metrics

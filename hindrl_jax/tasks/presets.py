@@ -17,8 +17,6 @@ they are and from the demonstrations:
     relabelling            where episodes have goals of their own, or parameters of the task in their observations, half of the replay rows, with
                            goals of demonstrations and rollouts; where all aim at the same, a fifth, with goals of demonstrations: there, other
                            goals are not what is to be learnt, and take rows of the batch
-    goals that vary        where episodes have goals of their own, networks see what is left of the way to them, too, and demonstrations are
-                           relabelled like rollouts
     target entropy         counts per action dimension
     random steps           one horizon in each environment
 
@@ -80,7 +78,7 @@ def _as_algorithm(config: TrainConfig, algo: Algorithm) -> TrainConfig:
     """TQCfD is HinDRL without relabelling, Smooth HinDRL is HinDRL with the filter (thesis sections 4.1.3 and 4.1.4)."""
     batch, goal = config.batch, config.goal
     if algo == "tqcfd":
-        batch = dataclasses.replace(batch, relabelled_per_original=0.0, relabel_demonstrations=False)
+        batch = dataclasses.replace(batch, relabelled_per_original=0.0)
     if algo == "smooth-hindrl":
         goal = dataclasses.replace(goal, epsilon_filtering=True)
     return dataclasses.replace(config, algo=algo, batch=batch, goal=goal)
@@ -91,21 +89,17 @@ def _default(algo: Algorithm, env: Environment) -> TrainConfig:
     goal = _goals(env)
     if algo == "bc":
         # Two wide layers imitate better than four narrow ones, and sooner (docs/cables.md).
-        batch, agent = BatchConfig(n_step=1), AgentConfig(net_arch=(256, 256), goal_difference=_gives_goals(env))
-        return TrainConfig(algo="bc", steps=1_500, eval_every=250, batch=batch, goal=goal, agent=agent)
-    return TrainConfig(goal=goal, batch=_batch(env), agent=AgentConfig(goal_difference=_gives_goals(env)))
+        agent = AgentConfig(net_arch=(256, 256))
+        return TrainConfig(algo="bc", steps=1_500, eval_every=250, batch=BatchConfig(n_step=1), goal=goal, agent=agent)
+    return TrainConfig(goal=goal, batch=_batch(env))
 
 
 def _batch(env: Environment) -> BatchConfig:
-    if _gives_goals(env):
-        return _MANY_GOALS
     return _MANY_TASKS if _has_many_tasks(env) else BatchConfig()
 
 
 _MANY_TASKS = BatchConfig(relabelled_per_original=1.0, hindrl_sampling_strategy="joint_union")
 """Relabelling where hindsight turns an episode into one of another task that is to be learnt, too."""
-_MANY_GOALS = dataclasses.replace(_MANY_TASKS, relabel_demonstrations=True)
-"""The same where such tasks differ in the goal alone, so that a demonstration of one is a demonstration of all that it reaches on its way."""
 
 
 def _gives_goals(env: Environment) -> bool:

@@ -131,8 +131,6 @@ def check_config(env: Environment, config: TrainConfig) -> None:
             raise UserError(f"joint_intersection compares goals, and hindsight changes none in {name}: choose another hindrl_sampling_strategy")
         if goal.has_achieved_goals:
             raise UserError(f"achieved_goal_ratio is for tasks with other goals than their own, which {name} has not: set it to 0")
-        if config.batch.relabel_demonstrations:
-            raise UserError(f"relabel_demonstrations changes goals, and hindsight changes none in {name}: set it to False")
     if config.demo_reset_ratio > 0.0 and not (in_jax and isinstance(env, Restorable)):
         missing = "restorable states" if in_jax else "restorable states in JAX"
         raise UserError(f"{name} cannot begin in demonstrated states: it has no {missing}: set demo_reset_ratio to 0")

@@ -80,7 +80,6 @@ VALUES = {
     "hindrl_sampling_strategy": ("future", "final"),
     "union_sampling_ratio": (0.3, 0.4),
     "intersection_goals": ("demonstrations", "rollout"),
-    "relabel_demonstrations": (True, False),
     "n_step": (3, 2),
     "gamma": (0.9, 0.8),
     "epsilon_steps": (2, 1),
@@ -112,7 +111,6 @@ VALUES = {
     "actor_loss": (lambda terms, config: jnp.mean(jnp.square(terms.mode)),),
     "critic_loss": (lambda terms, config: jnp.mean(jnp.square(terms.quantiles)),),
     "input_encoding": ("raw", "multiscale"),
-    "goal_difference": (True, False),
     "strict_goal_test": (True, False),
     "bootstrap_past_relabelled_goals": (True, False),
     "timeouts_are_terminal": (True, False),
@@ -174,7 +172,6 @@ BASES = {
     for name, values in {
         "hindrl": {},
         "bc": dict(algo="bc"),
-        "bc of relabelled demonstrations": dict(algo="bc", relabel_demonstrations=True),
         "tqcfd": dict(algo="tqcfd", relabelled_per_original=0.0),
         "tqcfd with achieved goals": dict(algo="tqcfd", relabelled_per_original=0.0, achieved_goal_ratio=0.5),
         "smooth-hindrl with sac": dict(algo="smooth-hindrl", epsilon_filtering=True, epsilon_steps=1, base="sac", demo_reset_ratio=0.5),

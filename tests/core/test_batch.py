@@ -234,41 +234,16 @@ def test_last_row_of_a_solved_demonstration_is_worth_one_and_ends():
     table = demonstrations().replace(rewards=jnp.asarray(rewards), terminated=jnp.ones(3, bool))
     rows, steps = zip(*[(i, t) for i, length in enumerate(DEMO_LENGTHS) for t in range(length)], strict=True)
     config = TrainConfig(batch=BatchConfig(gamma=0.5, n_step=1))
-    chosen = jnp.array(rows), jnp.array(steps)
-    batch = rows_of_demonstrations(jax.random.key(0), chosen, guidance().replace(demonstrations=table), NUMBERED, config)
+    batch = rows_of_demonstrations(table, jnp.array(rows), jnp.array(steps), NUMBERED, config)
     assert batch.reward.tolist() == [0, 0, 1, 1, 0, 1]
     assert batch.discount.tolist() == [0.5, 0.5, 0, 0, 0.5, 0]
     assert batch.is_demonstration.all()
     assert not batch.is_relabelled.any()
 
 
-def test_relabelled_demonstrations_have_goals_that_they_reach_later():
-    """Three in four, since there are three relabelled rows for each original one; the others are as recorded."""
-    config = TrainConfig(batch=dataclasses.replace(BATCH, batch_size=400, relabel_demonstrations=True))
-    batch = jax.device_get(jax.jit(lambda key: sample_demonstrations(key, guidance(), NUMBERED, config))(jax.random.key(0)))
-    as_recorded = dataclasses.replace(config, batch=dataclasses.replace(config.batch, relabel_demonstrations=False))
-    plain = jax.device_get(sample_demonstrations(jax.random.key(0), guidance(), NUMBERED, as_recorded))
-    assert batch.is_relabelled.tolist() == [True] * 300 + [False] * 100
-    assert batch.is_demonstration.all()
-    np.testing.assert_array_equal(batch.observation, plain.observation)
-    for name in ("desired_goal", "reward", "discount"):
-        np.testing.assert_array_equal(getattr(batch, name)[300:], getattr(plain, name)[300:])
-    goals = set()
-    for row in range(300):
-        demo, t = batch.observation[row, 1:3].astype(int)
-        goal = tuple(batch.desired_goal[row])
-        later = {tuple(NUMBERED.achieved_goal(state)): state[2] - t for state in np.asarray(guidance().demonstrations.observations[demo, t + 1 :])}
-        goals.add(int(later[goal]))
-        assert later[goal] >= 1
-        # One step or two, of which the one that reaches the goal is rewarded and ends the return; else the value counts, unless the episode is over.
-        assert batch.reward[row] == {1: 1.0, 2: 0.5}.get(int(later[goal]), 0.0)
-        assert batch.discount[row] == (0.0 if later[goal] <= 2 else 0.25)
-    assert goals == set(range(1, max(DEMO_LENGTHS) + 1))
-
-
 def test_a_batch_of_demonstrations_alone():
     config = TrainConfig(batch=dataclasses.replace(BATCH, batch_size=600, max_demo_ratio=0.0))
-    batch = jax.device_get(jax.jit(lambda key: sample_demonstrations(key, guidance(), NUMBERED, config))(jax.random.key(0)))
+    batch = jax.device_get(jax.jit(lambda key: sample_demonstrations(key, demonstrations(), NUMBERED, config))(jax.random.key(0)))
     assert batch.is_demonstration.tolist() == [True] * 600
     check_rows(batch, np.zeros(600, bool), {}, "task_conditioned", config)
     assert set(triples(batch.observation)) == {state for state in DEMO_STATES if state[2] < DEMO_LENGTHS[state[1]]}

@@ -1,6 +1,5 @@
 """What the networks see: encodings and their scale, by hand."""
 
-import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -37,21 +36,6 @@ def test_network_inputs_by_hand(encoding, achieved_goal_input, expected):
     np.testing.assert_allclose(unbatched, expected, rtol=1e-6)
     state = jax.eval_shape(lambda key: agents.init(key, scale, config, action_dim=1), jax.random.key(0))
     assert state.actor["params"]["Dense_0"]["kernel"].shape == (len(expected), 3)
-
-
-@pytest.mark.parametrize(
-    ("encoding", "expected"),
-    # What is left is 0 less 3; 6 is the size of a goal and 12 its centre, which a difference does not have.
-    [("raw", [-3.0]), ("standardised", [-0.5]), ("multiscale", [-0.5, np.tanh(-2.0)])],
-)
-def test_what_is_left_to_do_by_hand(encoding, expected):
-    scale = InputScale(observation=jnp.ones(2), goal=jnp.array([6.0]), observation_centre=jnp.zeros(2), goal_centre=jnp.array([12.0]))
-    parts = (jnp.array([1.0, 2.0]), jnp.array([3.0]), jnp.array([0.0]))
-    agent = AgentConfig(input_encoding=encoding, goal_difference=True)
-    inputs = network_inputs(*parts, scale, TrainConfig(agent=agent))
-    without = network_inputs(*parts, scale, TrainConfig(agent=dataclasses.replace(agent, goal_difference=False)))
-    np.testing.assert_array_equal(inputs[: len(without)], without)
-    np.testing.assert_allclose(inputs[len(without) :], expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("padding", [7.0, np.nan])

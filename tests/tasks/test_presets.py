@@ -174,9 +174,7 @@ def test_there_is_one_recipe_and_what_differs_follows_from_what_an_environment_d
         "BringNear": {},
         "CableInsertion": {},
         "ParameterizedReach": many_tasks | {"behavioural_goals": "task"},
-        "gymnasium:FetchReach-v4": many_tasks
-        | {"behavioural_goals": "environment", "epsilon": 0.02886}  # 0.05 over the root of 3
-        | {"relabel_demonstrations": True, "goal_difference": True},
+        "gymnasium:FetchReach-v4": many_tasks | {"behavioural_goals": "environment", "epsilon": 0.02886},  # 0.05 over the root of 3
     }
     assert preset("tqcfd", env="ParameterizedReach").batch.relabelled_per_original == 0.0
 

@@ -62,9 +62,6 @@ def test_goals_cannot_be_compared_where_hindsight_changes_none():
     batch = dataclasses.replace(config.batch, hindrl_sampling_strategy="joint_intersection")
     with pytest.raises(hindrl.UserError, match="joint_intersection compares goals"):
         hindrl.fit(env, hindrl.record_demonstrations(env, 1), dataclasses.replace(config, batch=batch), seeds=[0])
-    batch = dataclasses.replace(config.batch, relabel_demonstrations=True)
-    with pytest.raises(hindrl.UserError, match="relabel_demonstrations changes goals"):
-        hindrl.fit(env, hindrl.record_demonstrations(env, 1), dataclasses.replace(config, batch=batch), seeds=[0])
     goal = dataclasses.replace(config.goal, achieved_goal_ratio=0.5)
     with pytest.raises(hindrl.UserError, match="achieved_goal_ratio is for tasks"):
         hindrl.fit(env, hindrl.record_demonstrations(env, 1), dataclasses.replace(config, goal=goal), seeds=[0])
