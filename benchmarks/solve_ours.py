@@ -2,7 +2,7 @@
 
     python -m benchmarks.solve_ours --env FetchPush-v4 --seed 0 --steps 100000 --every 10000 --episodes 50 --module gymnasium_robotics --demos FILE
 
-Seconds count from the start of the program, compilation included, evaluations not.
+Seconds count from the start of the program, compilation included; of evaluations those of a few episodes that `fit` makes for itself, but not these.
 """
 
 from __future__ import annotations
@@ -23,9 +23,8 @@ import numpy as np  # noqa: E402
 
 import hindrl_jax  # noqa: E402
 from benchmarks.peers import episodes  # noqa: E402
-from hindrl_jax.base.environments import action_to_env  # noqa: E402
 from hindrl_jax.core.agent import policy  # noqa: E402
-from hindrl_jax.core.train import make_policy  # noqa: E402
+from hindrl_jax.runs.acting import TrainedPolicy  # noqa: E402
 
 
 def main() -> None:
@@ -45,7 +44,6 @@ def main() -> None:
         config = dataclasses.replace(config, steps=arguments.steps, eval_every=arguments.every)
     config = dataclasses.replace(config, action_hold=1, eval_episodes=config.num_envs)  # all evaluations are those below
     fresh = gymnasium.make(arguments.env)
-    act = jax.jit(lambda explorer, observation, goal: make_policy(explorer, env, config)(jax.random.key(0), observation, goal))
     seeds = range(10**6 * (1 + arguments.seed), 10**6 * (1 + arguments.seed) + arguments.episodes)
     seen, spent = 0, 0.0
 
@@ -54,11 +52,11 @@ def main() -> None:
         if len(result.rows) == seen:
             return
         seen, before = len(result.rows), time.perf_counter()
-        explorer = jax.tree.map(lambda leaf: leaf[0], policy(result.state.agent, average=True))
+        act = TrainedPolicy(env, config, jax.tree.map(lambda leaf: leaf[0], policy(result.state.agent, average=True)), None)
 
         def action(observation: dict[str, np.ndarray]) -> np.ndarray:
-            seen_now = np.concatenate([observation["observation"], observation["achieved_goal"]]).astype(np.float32)[None]
-            return np.asarray(action_to_env(act(explorer, seen_now, observation["desired_goal"].astype(np.float32)[None]), env))[0]
+            seen_now = np.concatenate([observation["observation"], observation["achieved_goal"]])
+            return np.asarray(act(seen_now, observation["desired_goal"]))
 
         found = episodes.outcomes(action, fresh, seeds)
         print(json.dumps({"steps": result.env_steps, "seconds": round(before - BEGAN - spent, 1)} | found), flush=True)

@@ -59,6 +59,16 @@ class Cell:
     def name(self) -> str:
         return f"{self.task}_{self.learner}_{self.num_demos}_{self.seed}"
 
+    def check_same(self, row: Row, given: argparse.Namespace) -> None:
+        """Makes sure that a cell that is there was run as this one is asked for.
+
+        Raises:
+          SystemExit: if it was not.
+        """
+        for name, asked in settings(self, given).items():
+            if row.get(name) != asked:
+                sys.exit(f"{given.out}/{self.name}.json was run with --{name} {row.get(name)}, not {asked}: choose another --out, or remove it")
+
     @property
     def ours(self) -> bool:
         return not self.learner.startswith("sb3")
@@ -93,10 +103,11 @@ def main() -> None:
                 print(f"{cell.name}: left out, {given.peers} is not there: `make bench` installs the peers; or name their interpreter with --peers")
                 continue
             path = given.out / f"{cell.name}.json"
-            if not path.exists():
+            if path.exists():
+                cell.check_same(json.loads(path.read_text()), given)
+            else:
                 print(f"{cell.name} ...", flush=True)
-                row = run(cell, given)
-                write(path, json.dumps(row))
+                write(path, json.dumps(run(cell, given)))
     rows = [json.loads(path.read_text()) for path in sorted(given.out.glob("*.json"))]
     if not rows:
         sys.exit(f"{given.out} holds no results: run without --only-report")
@@ -104,6 +115,11 @@ def main() -> None:
     text = table(rows)
     write(given.out / "time_to_solve.md", text)
     print(text)
+
+
+def settings(cell: Cell, given: argparse.Namespace) -> dict[str, float]:
+    """How far a cell is run, and by how many episodes it is judged."""
+    return {"minutes": given.minutes, "steps": given.steps or TASKS[cell.task][0], "episodes": given.episodes}
 
 
 def write(path: Path, text: str) -> None:
@@ -119,9 +135,8 @@ def run(cell: Cell, given: argparse.Namespace) -> Row:
     Raises:
       SystemExit: if its process fails.
     """
-    steps, every = TASKS[cell.task]
-    command = ["--env", f"{cell.task}-{VERSION}", "--module", MODULE, "--seed", cell.seed, "--steps", given.steps or steps, "--every", every]
-    command += ["--episodes", given.episodes]
+    command = ["--env", f"{cell.task}-{VERSION}", "--module", MODULE, "--seed", cell.seed, "--every", TASKS[cell.task][1]]
+    command += ["--steps", settings(cell, given)["steps"], "--episodes", given.episodes]
     if cell.num_demos:
         command += ["--demos", demonstrations(cell, given.out)]
     if cell.ours:
@@ -132,18 +147,25 @@ def run(cell: Cell, given: argparse.Namespace) -> Row:
     busy = os.getloadavg()[0] / (os.cpu_count() or 1)
     with errors.open("w") as log:
         process = subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, stderr=log, text=True, cwd=FOLDER.parent)
-        limit = threading.Timer(60 * given.minutes * 3, process.kill)  # evaluations take time that does not count, so this is for what hangs alone
+        hangs = threading.Event()
+
+        def stop() -> None:  # evaluations take time that does not count, so this is for what hangs alone
+            hangs.set()
+            process.kill()
+
+        limit = threading.Timer(60 * given.minutes * 3, stop)
         limit.start()
         points = read_points(process, 60.0 * given.minutes)
         ended = process.poll() is not None
         process.kill()
         limit.cancel()
         status = process.wait()
-    if ended and status:
+        process.stdout.close()
+    if ended and status and not hangs.is_set():
         sys.exit(f"{cell.name} failed: {errors} says why")
     errors.unlink()
-    measured = {"date": time.strftime("%Y-%m-%d"), "machine": report.machine(), "busy": round(busy, 2), "minutes": given.minutes}
-    return dataclasses.asdict(cell) | measured | {"points": points}
+    measured = {"date": time.strftime("%Y-%m-%d"), "machine": report.machine(), "busy": round(busy, 2), "stopped": hangs.is_set()}
+    return dataclasses.asdict(cell) | settings(cell, given) | measured | {"points": points}
 
 
 def read_points(process: subprocess.Popen[str], seconds: float) -> list[dict[str, float]]:

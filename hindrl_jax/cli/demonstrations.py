@@ -22,7 +22,7 @@ from hindrl_jax.demonstrations.recording import summarise_recording
 from hindrl_jax.experts.by_hand import record_by_hand
 from hindrl_jax.experts.robosuite_arm import DeviceName
 from hindrl_jax.runs.reader import draw_episodes
-from hindrl_jax.tasks.registry import TASKS, make, task
+from hindrl_jax.tasks.registry import TASKS, checked, make, task
 from hindrl_jax.training.playing import plays_one_by_one
 from hindrl_jax.training.recording import record_demonstrations
 
@@ -93,7 +93,7 @@ def _record_by_hand(env: Any, options: Record) -> tuple[Environment, Episodes]:
         )
     if env.backend not in ("closed_form", "robosuite"):
         raise UserError(f"--device {options.device} steers the arm of robosuite: drop --backend {env.backend}, or drop --device")
-    env = dataclasses.replace(env, backend="robosuite")
+    env = checked(lambda: dataclasses.replace(env, backend="robosuite"))
     return env, record_by_hand(episode_key(options.seed), env, options.device, options.demos, report=console.print)
 
 

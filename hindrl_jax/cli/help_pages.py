@@ -106,7 +106,7 @@ def _groups(kind: type[Any], defaults: Any, title: str) -> Iterator[Group]:
             nested += _groups(hint, None if default is dataclasses.MISSING else default, below)  # type: ignore[arg-type]
             continue
         text = next((given.help for given in metadata if getattr(given, "help", None)), texts.get(field.name, ""))
-        said = "" if "(default: " in text or default in (None, (), dataclasses.MISSING) else f"(default: {_typed(default)})"
+        said = "" if "(default: " in text or default in (None, (), dataclasses.MISSING) else f"(default: {as_typed(default)})"
         if default is dataclasses.MISSING and _MARKER not in metadata:
             said = "(required)"
         if hint is bool:
@@ -122,7 +122,8 @@ def _default_of(field: dataclasses.Field[Any]) -> Any:
     return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
 
 
-def _typed(value: Any) -> str:
+def as_typed(value: Any) -> str:
+    """A value as the command line takes it."""
     if callable(value):
         return function_name(value)
     return " ".join(map(str, value)) if isinstance(value, tuple | list) else str(value)

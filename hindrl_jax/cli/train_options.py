@@ -12,6 +12,7 @@ import tyro
 
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.cli.common import ENV_HELP, env_names, environment_of, parse, peek, seeds_from
+from hindrl_jax.cli.help_pages import as_typed
 from hindrl_jax.config import TrainConfig, without_effect
 from hindrl_jax.demonstrations.convert import MINARI_PREFIX, open_source
 from hindrl_jax.runs.spec import FROM_PYTHON, RunSpec, read_spec
@@ -224,7 +225,7 @@ def _as_given(name: str, value: Any) -> str:
     flag = name.replace("_", "-")
     if isinstance(value, bool):
         return f"--{flag}" if value else f"--no-{flag}"
-    return " ".join([f"--{flag}", *map(str, value if isinstance(value, tuple) else (value,))])
+    return f"--{flag} {as_typed(value)}"
 
 
 def parse_resume(arguments: list[str], program: str) -> ResumeOptions:

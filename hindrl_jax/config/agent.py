@@ -91,6 +91,8 @@ class AgentConfig:
             actor_average_span=(self.actor_average_span >= 0.0, "0 or more"),
             initial_alpha=(self.initial_alpha > 0.0, "greater than 0"),
             bc_weight=(self.bc_weight >= 0.0, "0 or more"),
+            actor_network=(not _is_module(self.actor_network), "a class or a function that returns a module, not a module"),
+            critic_network=(not _is_module(self.critic_network), "a class or a function that returns a module, not a module"),
         )
         if self.residual and len(set(self.net_arch)) > 1:
             raise ValueError(f"residual adds up layers of equal widths, but net_arch = {self.net_arch}: give equal ones, or turn residual off")
@@ -106,3 +108,8 @@ class AgentConfig:
     def critic_outputs(self) -> int:
         """Numbers that each critic returns: its quantiles, or one value."""
         return self.num_quantiles if self.base == "tqc" else 1
+
+
+def _is_module(network: Any) -> bool:
+    """Whether a network of one's own is itself a module of flax, which is a dataclass."""
+    return dataclasses.is_dataclass(network) and not isinstance(network, type)

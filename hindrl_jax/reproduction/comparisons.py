@@ -39,7 +39,7 @@ class Compared:
     chance: Interval
     """That a seed of the first is better than one of the second; equal ones count half."""
     said: Literal["first", "second", "open"]
-    """Which of the two is better; open where the interval holds 1/2, or a cell has fewer than 4 seeds to measure."""
+    """Which of the two is better; open where runs are too short, the interval holds 1/2, or a cell has fewer than 4 seeds to measure."""
 
 
 def pairs() -> list[Pair]:
@@ -53,8 +53,8 @@ def pairs() -> list[Pair]:
     return [Pair(claims, *pair) for pair, claims in letters.items()]
 
 
-def compare(pair: Pair, runs: Runs) -> list[Compared]:
-    """A pair by each measure that both of its cells have; nothing if one was not run."""
+def compare(pair: Pair, runs: Runs, *, settles: bool = True) -> list[Compared]:
+    """A pair by each measure that both of its cells have; nothing if one was not run. Runs that are too short to settle anything leave it open."""
     if pair.first not in runs or pair.second not in runs:
         return []
     first, second, found = runs[pair.first], runs[pair.second], []
@@ -67,6 +67,6 @@ def compare(pair: Pair, runs: Runs) -> list[Compared]:
         if measure not in MORE_IS_BETTER:
             values = [-value for value in values]
         chance = stratified_bootstrap(values, lambda groups: probability_of_improvement(*groups))
-        settled = min(map(len, values)) >= FEWEST_SEEDS and chance.excludes(0.5)
+        settled = settles and min(map(len, values)) >= FEWEST_SEEDS and chance.excludes(0.5)
         found.append(Compared(pair, measure, chance, "open" if not settled else "first" if chance.estimate > 0.5 else "second"))
     return found

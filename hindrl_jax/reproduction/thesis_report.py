@@ -70,7 +70,7 @@ def write(out: Path, scale: ScaleName) -> list[str]:
         pictures = _draw_all(out, readings, scale)
         _write_csv(out / CELLS_TABLE, _CELL_COLUMNS, _cell_rows(readings, scale))
         _write_csv(out / CLAIMS_TABLE, _CLAIM_COLUMNS, _claim_rows(judged))
-        _write_csv(out / PAIRS_TABLE, _PAIR_COLUMNS, _pair_rows(readings))
+        _write_csv(out / PAIRS_TABLE, _PAIR_COLUMNS, _pair_rows(readings, settles=settles))
         (out / TEXT).write_text("\n".join(markdown(readings, judged, scale=scale, pictures=pictures)) + "\n")
     return [TEXT, CLAIMS_TABLE, PAIRS_TABLE, CELLS_TABLE, *pictures]
 
@@ -128,7 +128,7 @@ def markdown(readings: Readings, judged: Mapping[str, Mapping[Recipe, list[Judge
     lines += [_claim_line(claim, judged[claim.letter]) for claim in CLAIMS]
     lines += ["", "The parts of the claims:", ""]
     lines += [f"- ({claim.letter}) {part.what}; true if {_between(part.true_between)}" for claim in CLAIMS for part in claim.parts]
-    lines += ["", *_pair_lines(readings), "## Tables and figures", "", _OF_TABLES]
+    lines += ["", *_pair_lines(readings, settles=SCALES[scale].settles_claims), "## Tables and figures", "", _OF_TABLES]
     for name, artifact in ARTIFACTS.items():
         there = {recipe: runs for recipe, runs in readings.items() if set(artifact.settings) & set(runs)}
         if there:
@@ -152,11 +152,11 @@ def _time_lines(readings: Readings) -> list[str]:
     return [*lines, ""] if len(lines) > 5 else []
 
 
-def _pair_lines(readings: Readings) -> list[str]:
+def _pair_lines(readings: Readings, *, settles: bool) -> list[str]:
     """A table for each recipe that has a pair."""
     lines = []
     for recipe, runs in readings.items():
-        rows = [(pair, {one.measure: one for one in compare(pair, runs)}) for pair in pairs()]
+        rows = [(pair, {one.measure: one for one in compare(pair, runs, settles=settles)}) for pair in pairs()]
         rows = [(pair, found) for pair, found in rows if found]
         if rows:
             lines += [f"With {RECIPE_NAMES[recipe]}:", "", f"| pair | claims | {' | '.join(IN_WORDS.values())} |", "|---|---|---|---|---|"]
@@ -259,8 +259,8 @@ def _claim_rows(judged: Mapping[str, Mapping[Recipe, list[Judged]]]) -> list[dic
 _PAIR_COLUMNS = ("claims", "first", "second", "measure", "recipe", "chance", "low", "high", "better")
 
 
-def _pair_rows(readings: Readings) -> list[dict[str, Any]]:
-    found = [(recipe, one) for pair in pairs() for recipe, runs in readings.items() for one in compare(pair, runs)]
+def _pair_rows(readings: Readings, *, settles: bool) -> list[dict[str, Any]]:
+    found = [(recipe, one) for pair in pairs() for recipe, runs in readings.items() for one in compare(pair, runs, settles=settles)]
     rows = []
     for recipe, one in found:
         names = (f"{setting.task} {setting.algo}" for setting in (one.pair.first, one.pair.second))

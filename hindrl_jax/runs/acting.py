@@ -51,7 +51,7 @@ class TrainedPolicy:
 
     @in_float32
     def __call__(self, observation: Any, goal: Any = None, key: Array | None = None) -> Array:
-        """The action, within the bounds.
+        """The action, within the bounds. The key comes last, unlike elsewhere, since most calls need none.
 
         Args:
           observation: (..., D) in the task's units.
@@ -87,7 +87,7 @@ class TrainedValue:
         Args:
           observation: (..., D) in the task's units.
           goal: (..., G) likewise; None for `self.policy.goal`.
-          action: what the policy would give; None for its mean action.
+          action: (..., A) in the task's units, or with chunks (..., action_hold, A), as the policy gives it; None for its mean action.
 
         Returns:
           (...,) values.
@@ -99,8 +99,9 @@ class TrainedValue:
         action = policy(observation, goal) if action is None else jnp.asarray(action, jnp.float32)
         observation, goal, leading = _inputs(observation, goal, policy)
         shape = (policy.action_hold, policy.env.action_dim) if policy.chunks else (policy.env.action_dim,)
-        if action.shape[action.ndim - len(shape) :] != shape:
-            raise UserError(f"an action of shape {action.shape} is none of {policy.env.name}: give (..., {', '.join(map(str, shape))})")
+        fits = action.shape[action.ndim - len(shape) :] == shape
+        if not fits or action.shape[: action.ndim - len(shape)] not in ((), leading):
+            raise UserError(f"an action of shape {action.shape} does not go with {policy.env.name} here: give one of {(*leading, *shape)}")
         action = jnp.broadcast_to(action, (*leading, *shape)).reshape(len(observation), -1)
         return _value(self.critics, policy.policy, observation, goal, action, policy.env, policy.config).reshape(leading)
 

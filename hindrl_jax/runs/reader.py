@@ -18,7 +18,7 @@ from flax.traverse_util import unflatten_dict
 from hindrl_jax.base.compilation import in_float32
 from hindrl_jax.base.environments import Environment, Restorable
 from hindrl_jax.base.errors import UserError, one_line
-from hindrl_jax.base.files import DAMAGED_ARCHIVE, disk_trouble, read_arrays, write_atomically
+from hindrl_jax.base.files import DAMAGED_ARCHIVE, check_can_write, disk_trouble, read_arrays, write_atomically
 from hindrl_jax.base.steppers import Watchable
 from hindrl_jax.base.types import Episodes
 from hindrl_jax.core.agent import Params, Policy, init, policy
@@ -111,6 +111,8 @@ class Run:
         save_numpy_policy(content, *numpy_form(self.policy(seed)))
         path = Path(folder) / "policy.npz"
         code = Path(numpy_policy.__file__)
+        for file in (path, path.with_name(code.name)):
+            check_can_write(file, overwrite=overwrite)
         write_atomically(path, content.getvalue(), overwrite=overwrite)
         write_atomically(path.with_name(code.name), code.read_bytes(), overwrite=overwrite)
         return path

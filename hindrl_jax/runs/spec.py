@@ -22,7 +22,7 @@ from typing import Any, get_args, get_type_hints
 from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.config import TrainConfig
-from hindrl_jax.tasks.functions import find_function, function_name, is_function
+from hindrl_jax.tasks.functions import find_function, function_name, is_found_again, is_function
 from hindrl_jax.tasks.registry import did_you_mean, full_name, make
 from hindrl_jax.training.result import Row
 
@@ -118,6 +118,12 @@ def _config_from_dict(config_class: type[Any], data: Any, name: str, where: Path
         return config_class(**values)
     except ValueError as error:
         raise UserError(f"{where}: {error}") from error
+
+
+def lost_functions(config: TrainConfig) -> list[str]:
+    """Names of the config's functions that cannot be found again when its run is read."""
+    fields = {field.name: getattr(config.agent, field.name) for field in dataclasses.fields(config.agent)}
+    return [name for name, value in fields.items() if callable(value) and not is_found_again(value)]
 
 
 def _with_names(values: dict[str, Any]) -> dict[str, Any]:

@@ -40,6 +40,7 @@ from hindrl_jax.runs.spec import (
     RUN_FILES,
     SUMMARY,
     RunSpec,
+    lost_functions,
 )
 from hindrl_jax.tasks.registry import viewer
 from hindrl_jax.training.result import Result, Row
@@ -173,6 +174,11 @@ def save_run(path: str | os.PathLike[str], result: Result, *, demos: str = FROM_
     """
     if len(set(result.configs)) > 1:
         raise UserError("the runs of this result have different configs: save each config's own, for example result.part(slice(0, 8))")
+    if lost := lost_functions(result.config):
+        warnings.warn(
+            f"{', '.join(lost)} of this run will not be found when it is read: put it at the top of a module",
+            stacklevel=2,
+        )
     writer = RunWriter(Path(path), RunSpec(env=result.env, config=result.config, demos=demos, seeds=result.seeds), overwrite=overwrite)
     writer.start()
     return writer.finish(result)

@@ -22,6 +22,14 @@ def function_name(function: Any) -> str:
     return f"{type(function).__module__}:{type(function).__qualname__} object"  # which is not found again
 
 
+def is_found_again(function: Any) -> bool:
+    """Whether `find_function` finds this very function by its name: not a lambda, one made within another, or what functools.partial makes."""
+    try:
+        return find_function(function_name(function)) is function
+    except UserError:
+        return False
+
+
 def find_function(name: str) -> Any:
     """The function or class of that name; its module is imported from PYTHONPATH or, last of all, the working directory.
 

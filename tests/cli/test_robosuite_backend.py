@@ -125,6 +125,7 @@ def test_a_device_needs_a_robot(tmp_path, capsys):
     assert "--device joystick is not usable: choose one of " in refusal(capsys, *arguments, "--env", COARSE.name, "--device", "joystick")
     assert "drop --backend mjx" in refusal(capsys, *arguments, "--env", COARSE.name, "--backend", "mjx")
     assert "expert's options" in refusal(capsys, *arguments, "--env", COARSE.name, "--randomness-scale", "0.05")
+    assert "randomised" in refusal(capsys, *arguments, "--env", "BringNear", "--randomised")
 
 
 def test_a_place_that_cannot_be_written_is_refused_before_anybody_plays(tmp_path, capsys, monkeypatch):

@@ -6,6 +6,7 @@ import inspect
 from pathlib import Path
 
 import pytest
+from flax import linen as nn
 
 import hindrl_jax
 from hindrl_jax.config import AgentConfig, BatchConfig, GoalConfig, QuirksConfig, TrainConfig, without_effect
@@ -107,6 +108,7 @@ BAD = [
     (AgentConfig, "final_target_entropy", [float("nan")]),
     (AgentConfig, "bc_weight", [-1.0]),
     *((AgentConfig, f"{of}_{what}", ["module:Name", 3]) for of in ("actor", "critic") for what in ("network", "loss")),
+    (AgentConfig, "actor_network", [nn.Dense(3)]),  # the class is what is asked for
     (AgentConfig, "input_encoding", ["scaled", "standardized"]),
     (QuirksConfig, "strict_goal_test", [1, "yes"]),
     (QuirksConfig, "bootstrap_past_relabelled_goals", [0]),

@@ -1,6 +1,5 @@
 """What the networks see: encodings and their scale, by hand."""
 
-
 import jax
 import jax.numpy as jnp
 import numpy as np

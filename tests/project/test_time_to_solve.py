@@ -47,7 +47,7 @@ def test_cells_that_are_there_are_not_run_again(tmp_path, monkeypatch, capsys):
 
     def run(cell_, given):
         ran.append(cell_.name)
-        return cell(cell_.learner, cell_.seed, 1.0)
+        return cell(cell_.learner, cell_.seed, 1.0) | time_to_solve.settings(cell_, given)
 
     monkeypatch.setattr(time_to_solve, "run", run)
     monkeypatch.setattr(time_to_solve, "plot", lambda rows, path: None)
@@ -58,6 +58,27 @@ def test_cells_that_are_there_are_not_run_again(tmp_path, monkeypatch, capsys):
     assert ran == ["FetchPush_hindrl_20_0", "FetchPush_hindrl_20_1"]
     assert "FetchPush_sb3_0_0: left out" in capsys.readouterr().out
     assert "2/2" in (tmp_path / "time_to_solve.md").read_text()
+    monkeypatch.setattr(sys, "argv", ["time_to_solve", *given, "--seeds", "1", "--minutes", "1"])
+    with pytest.raises(SystemExit, match=r"FetchPush_hindrl_20_0\.json was run with --minutes 15\.0, not 1\.0: choose another --out"):
+        time_to_solve.main()
+
+
+@pytest.mark.parametrize(("after", "stopped"), [("time.sleep(60)", True), ("", False), ("sys.exit(3)", None)])
+def test_a_worker_that_hangs_is_stopped_and_one_that_fails_ends_the_benchmark(after, stopped, tmp_path, monkeypatch):
+    (point,) = cell("sb3", 0, 0.5)["points"]
+    worker = tmp_path / "worker.py"
+    worker.write_text(f"import sys, time\nprint({json.dumps(point | {'seconds': 0.0})!r}, flush=True)\n{after}\n")
+    (tmp_path / "peers").mkdir()
+    worker.rename(tmp_path / "peers" / "solve_sb3.py")
+    monkeypatch.setattr(time_to_solve, "FOLDER", tmp_path)
+    given = time_to_solve.arguments(["--minutes", "0.05", "--out", str(tmp_path), "--peers", sys.executable])
+    asked = time_to_solve.Cell("FetchPush", "sb3", 0, 0)
+    if stopped is None:
+        with pytest.raises(SystemExit, match="FetchPush_sb3_0_0 failed"):
+            time_to_solve.run(asked, given)
+        return
+    row = time_to_solve.run(asked, given)
+    assert (row["stopped"], row["points"], row["steps"]) == (stopped, [point | {"seconds": 0.0}], 75_000)
 
 
 class Counting:

@@ -33,6 +33,13 @@ def test_chances_by_hand():
     assert compare(PAIRS[HINDRL, TQCFD], {HINDRL: better}) == []
 
 
+def test_runs_that_are_too_short_leave_all_open():
+    better, worse = (recorded([[share] * 8], episode_length=[[40.0] * 8]) for share in (1.0, 0.0))
+    for settles, said in ((True, "first"), (False, "open")):
+        (one,) = [one for one in compare(PAIRS[HINDRL, TQCFD], {HINDRL: better, TQCFD: worse}, settles=settles) if one.measure == "success"]
+        assert one.said == said
+
+
 def test_equal_cells_are_open():
     run = recorded([[0.96] * 8], episode_length=[[40.0] * 8])
     for one in compare(PAIRS[HINDRL, TQCFD], {HINDRL: run, TQCFD: run}):

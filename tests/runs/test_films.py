@@ -35,6 +35,7 @@ def test_films_are_of_the_policy_of_their_moment(tmp_path, capsys):
     cli.main([*TRAIN, "--render-every", "130", "--out", str(out), "--overwrite"])
     assert sorted(path.name for path in (out / "films").iterdir()) == ["step_204.gif", "step_260.gif"]
     assert ", films\n" in capsys.readouterr().out
+    assert not np.array_equal(*(frames(out / "films" / f"step_{step}.gif")[10:20] for step in (204, 260)))
     load_run(out, last=True).render(tmp_path / "last.gif", key=jax.random.key(0))
     np.testing.assert_array_equal(frames(out / "films" / "step_260.gif"), frames(tmp_path / "last.gif"))
 

@@ -134,6 +134,11 @@ def test_an_exported_policy_plays_where_there_is_no_jax(tmp_path):
     with pytest.raises(hindrl.UserError, match="exists"):
         run.export_policy(tmp_path / "robot")
     run.export_policy(tmp_path / "robot", overwrite=True)
+    (tmp_path / "half").mkdir()
+    (tmp_path / "half" / "numpy_policy.py").touch()
+    with pytest.raises(hindrl.UserError, match="exists"):
+        run.export_policy(tmp_path / "half")
+    assert not (tmp_path / "half" / "policy.npz").exists()
     observation, _ = draws(run.spec.env, 3)
     np.save(tmp_path / "robot" / "observation.npy", observation)
     code = """
@@ -175,7 +180,8 @@ def test_what_has_no_form_in_numpy_is_refused(case, name):
     [
         (lambda run: run.policy()(np.zeros(3)), r"an observation of shape \(3,\) is none of FixedGridPickAndPlace: give \(\.\.\., 10\)"),
         (lambda run: run.policy()(np.zeros(10), np.zeros((2, 4))), r"a goal of shape \(2, 4\) is none of .*: give \(\.\.\., 10\)"),
-        (lambda run: run.value()(np.zeros(10), action=np.zeros(2)), r"an action of shape \(2,\) is none of .*: give \(\.\.\., 5\)"),
+        (lambda run: run.value()(np.zeros(10), action=np.zeros(2)), r"an action of shape \(2,\) does not go with .*: give one of \(5,\)"),
+        (lambda run: run.value()(np.zeros((3, 10)), action=np.zeros((2, 5))), r"an action of shape \(2, 5\) .*: give one of \(3, 5\)"),
         (lambda run: run.policy(6), "has no seed 6: choose one of 5, 7"),
         (lambda run: run.value(6), "has no seed 6: choose one of 5, 7"),
         (lambda run: dataclasses.replace(run, critics=None).value(), "holds no critics"),

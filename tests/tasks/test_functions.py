@@ -1,5 +1,6 @@
 """Functions of one's own by name, as config.json and the command line have them."""
 
+import dataclasses
 import functools
 import json
 from pathlib import Path
@@ -9,8 +10,9 @@ from flax import linen as nn
 
 import hindrl_jax as hindrl
 from hindrl_jax.cli.train_options import parse_train
+from hindrl_jax.config import TrainConfig
 from hindrl_jax.core import losses
-from hindrl_jax.runs.spec import RunSpec
+from hindrl_jax.runs.spec import RunSpec, lost_functions
 from hindrl_jax.tasks.functions import find_function, function_name
 
 MODULE = """
@@ -46,6 +48,15 @@ def test_what_is_not_there_is_named(name, message):
     with pytest.raises(hindrl.UserError, match=message) as error:
         find_function(name)
     assert "\n" not in str(error.value)
+
+
+def test_functions_that_a_run_cannot_find_again_are_named():
+    def config(**functions):
+        return TrainConfig(agent=dataclasses.replace(TrainConfig().agent, **functions))
+
+    lost = config(actor_network=functools.partial(nn.Dense, use_bias=False), critic_loss=lambda terms, config: 0.0)
+    assert lost_functions(lost) == ["actor_network", "critic_loss"]
+    assert lost_functions(config(actor_network=nn.Dense, actor_loss=losses.actor_loss)) == []
 
 
 def test_the_command_line_and_files_have_names_in_place_of_functions(tmp_path, monkeypatch):
