@@ -107,7 +107,7 @@ def test_what_is_interrupted_is_trained_again_and_said_in_a_line(finished, tmp_p
     run(tmp_path, "--options", "n-step-1")
     printed = capsys.readouterr().out
     assert "1 setting to train, 2 seeds from 7, 1 finished before" in printed
-    assert len(re.findall(r"^small +n-step-1 +\d of 2 reach 95%, median .* returned +\d+% +[\d.]+ s$", printed, re.MULTILINE)) == 1
+    assert len(re.findall(r"^small +n-step-1 +\d of 2 reach 95%, median .* returned +\d+% +[\d.]+ s +\d+ s of CPU$", printed, re.MULTILINE)) == 1
 
 
 def test_runs_of_other_options_are_refused_and_replaced_only_on_request(finished, capsys):
