@@ -23,7 +23,7 @@ _PACE = 0.033  # m, the displacement of a step where an action of 1 is repeated
 
 @dataclass(frozen=True)
 class _FetchExpert:
-    """What both experts share."""
+    """What all of them share."""
 
     tasks: ClassVar[str]  # how the ids of its environments begin
 

@@ -7,9 +7,7 @@ observations. With `--demos FILE` the demonstrations of an npz file (`time_to_so
 Seconds count from the start of the program, without evaluations. All cores that the process may use.
 """
 
-import argparse
 import importlib
-import json
 import time
 
 BEGAN = time.perf_counter()
@@ -29,18 +27,13 @@ SETTINGS = {"FetchReach": SMALL, "FetchPush": LARGE, "FetchSlide": LARGE, "Fetch
 class Evaluate(BaseCallback):
     """Plays fresh episodes every so many steps."""
 
-    def __init__(self, env: gymnasium.Env, arguments: argparse.Namespace):
+    def __init__(self, judge: episodes.Judge, every: int):
         super().__init__()
-        self.env, self.arguments, self.spent = env, arguments, 0.0
+        self.judge, self.every = judge, every
 
     def _on_step(self) -> bool:
-        if self.num_timesteps % self.arguments.every:
-            return True
-        before = time.perf_counter()
-        seeds = range(10**6 * (1 + self.arguments.seed), 10**6 * (1 + self.arguments.seed) + self.arguments.episodes)
-        found = episodes.outcomes(lambda observation: self.model.predict(observation, deterministic=True)[0], self.env, seeds)
-        print(json.dumps({"steps": self.num_timesteps, "seconds": round(before - BEGAN - self.spent, 1)} | found), flush=True)
-        self.spent += time.perf_counter() - before
+        if self.num_timesteps % self.every == 0:
+            self.judge(self.num_timesteps, lambda observation: self.model.predict(observation, deterministic=True)[0])
         return True
 
 
@@ -61,11 +54,7 @@ def add_demonstrations(buffer: HerReplayBuffer, path: str) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env", required=True)
-    parser.add_argument("--module", required=True, help="what registers it")
-    for name in ("seed", "steps", "every", "episodes"):
-        parser.add_argument(f"--{name}", type=int, required=True)
+    parser = episodes.parser(__doc__)
     parser.add_argument("--demos", metavar="FILE")
     arguments = parser.parse_args()
     importlib.import_module(arguments.module)
@@ -83,7 +72,7 @@ def main() -> None:
     )
     if arguments.demos:
         add_demonstrations(model.replay_buffer, arguments.demos)
-    model.learn(arguments.steps, callback=Evaluate(gymnasium.make(arguments.env), arguments))
+    model.learn(arguments.steps, callback=Evaluate(episodes.Judge(BEGAN, arguments), arguments.every))
 
 
 if __name__ == "__main__":

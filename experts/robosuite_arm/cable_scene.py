@@ -19,7 +19,6 @@ import numpy as np
 from hindrl_jax.envs import panda
 from hindrl_jax.envs.cable import CableState, chains, geometry, model
 from hindrl_jax.experts.robosuite_arm.arm import RobosuiteScene
-from hindrl_jax.experts.robosuite_arm.installation import quiet
 from hindrl_jax.experts.robosuite_arm.scene import scene_class
 
 _VIEW = dict(lookat=(-0.5, 0.0, 1.35), distance=1.5, azimuth=180.0, elevation=-15.0)  # from the front, where "right" is right
@@ -36,9 +35,6 @@ def environment_class() -> type[Any]:
       UserError: see `import_robosuite`.
     """
     base: Any = scene_class()
-    with quiet():
-        from robosuite.models.arenas import EmptyArena
-        from robosuite.models.tasks import ManipulationTask
 
     class RobosuiteCables(base):
         """A robosuite environment: two Pandas before two hanging cables. Its reward is 0; the rules of our tasks say when they are solved."""
@@ -55,16 +51,16 @@ def environment_class() -> type[Any]:
             super()._load_model()
             for robot, place in zip(self.robots, geometry.BASES, strict=True):
                 robot.robot_model.set_base_xpos(place - _PEDESTAL)
-            arena = EmptyArena()
-            arena.set_origin([0, 0, 0])
+            self.build(self._add_cables)
+            self.model.root.find("option").attrib.update(_OPTIONS)
+
+        def _add_cables(self, arena: Any) -> None:
             arena.asset.extend(model.materials())
             for element in model.hanging(self.num_links):
                 for geom in element.iter("geom"):
                     geom.attrib = {"contype": "0", "conaffinity": "0", "mass": "0"} | geom.attrib
                 arena.worldbody.append(element)
             arena.contact.extend(model.pairs(_PADS))
-            self.model = ManipulationTask(mujoco_arena=arena, mujoco_robots=[robot.robot_model for robot in self.robots])
-            self.model.root.find("option").attrib.update(_OPTIONS)
 
         def _reset_internal(self) -> None:
             super()._reset_internal()

@@ -6,6 +6,7 @@ The controller is robosuite's IK_POSE at 20 Hz, with its broken default input ty
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,8 @@ def scene_class() -> type[Any]:
     import_robosuite()
     with quiet():
         from robosuite.environments.manipulation.manipulation_env import ManipulationEnv
+        from robosuite.models.arenas import EmptyArena
+        from robosuite.models.tasks import ManipulationTask
 
     class RobosuiteScene(ManipulationEnv):
         """Pandas on their pedestals, moved at 20 Hz by robosuite's IK_POSE, shown in a window that stays open."""
@@ -48,6 +51,13 @@ def scene_class() -> type[Any]:
                 ignore_done=True,
             )
             super().__init__(**defaults | options)
+
+        def build(self, fill: Callable[[Any], None]) -> None:
+            """Makes the model: the robots, where they are now, and an empty room that `fill` is called with."""
+            arena = EmptyArena()
+            arena.set_origin([0, 0, 0])
+            fill(arena)
+            self.model = ManipulationTask(mujoco_arena=arena, mujoco_robots=[robot.robot_model for robot in self.robots])
 
         def reward(self, action: Any = None) -> float:
             del action
@@ -75,8 +85,6 @@ def environment_class() -> type[Any]:
     base: Any = scene_class()
     with quiet():
         import mujoco
-        from robosuite.models.arenas import EmptyArena
-        from robosuite.models.tasks import ManipulationTask
         from robosuite.utils.mjcf_utils import new_site
 
     class RobosuiteReach(base):
@@ -102,13 +110,13 @@ def environment_class() -> type[Any]:
             super()._load_model()
             robot = self.robots[0].robot_model
             robot.set_base_xpos(robot.base_xpos_offset["empty"])
-            arena = EmptyArena()
-            arena.set_origin([0, 0, 0])
+            self.build(self._add_waypoints)
+
+        def _add_waypoints(self, arena: Any) -> None:
             for index, opacity in enumerate(np.linspace(1.0, _LEAST_OPAQUE, len(self.positions))):
                 rgba = (*_WAYPOINT_GREEN, opacity)
                 arena.worldbody.append(new_site(f"waypoint{index}", rgba, size=(0.012, 0.04), type="capsule"))
                 arena.worldbody.append(new_site(f"waypoint{index}_fingers", rgba, size=(0.003, 0.04, 0.003), type="box"))
-            self.model = ManipulationTask(mujoco_arena=arena, mujoco_robots=[robot])
 
         def _reset_internal(self) -> None:
             super()._reset_internal()

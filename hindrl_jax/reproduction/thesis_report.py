@@ -36,6 +36,8 @@ from hindrl_jax.runs.recorded import RecordedRun, read_recorded
 TEXT, CLAIMS_TABLE, PAIRS_TABLE, CELLS_TABLE = "report.md", "claims.csv", "pairs.csv", "cells.csv"
 Readings = Mapping[Recipe, Runs]
 """The finished runs of each recipe."""
+Comparisons = Mapping[Recipe, list[Compared]]
+"""Pairs of cells by all measures, under each recipe."""
 PROFILES = "profiles"
 """What the names of their pictures begin with."""
 
@@ -65,13 +67,14 @@ def write(out: Path, scale: ScaleName) -> list[str]:
     judged = {
         claim.letter: {recipe: [judge(part, runs, settles=settles) for part in claim.parts] for recipe, runs in readings.items()} for claim in CLAIMS
     }
+    compared = {recipe: [one for pair in pairs() for one in compare(pair, runs, settles=settles)] for recipe, runs in readings.items()}
     with disk_trouble(out):
         out.mkdir(parents=True, exist_ok=True)
         pictures = _draw_all(out, readings, scale)
         _write_csv(out / CELLS_TABLE, _CELL_COLUMNS, _cell_rows(readings, scale))
         _write_csv(out / CLAIMS_TABLE, _CLAIM_COLUMNS, _claim_rows(judged))
-        _write_csv(out / PAIRS_TABLE, _PAIR_COLUMNS, _pair_rows(readings, settles=settles))
-        (out / TEXT).write_text("\n".join(markdown(readings, judged, scale=scale, pictures=pictures)) + "\n")
+        _write_csv(out / PAIRS_TABLE, _PAIR_COLUMNS, _pair_rows(compared))
+        (out / TEXT).write_text("\n".join(markdown(readings, judged, compared, scale=scale, pictures=pictures)) + "\n")
     return [TEXT, CLAIMS_TABLE, PAIRS_TABLE, CELLS_TABLE, *pictures]
 
 
@@ -111,12 +114,20 @@ higher line is better; where two lines cross, neither is.
 """
 
 
-def markdown(readings: Readings, judged: Mapping[str, Mapping[Recipe, list[Judged]]], *, scale: ScaleName, pictures: Iterable[str] = ()) -> list[str]:
+def markdown(
+    readings: Readings,
+    judged: Mapping[str, Mapping[Recipe, list[Judged]]],
+    compared: Comparisons,
+    *,
+    scale: ScaleName,
+    pictures: Iterable[str] = (),
+) -> list[str]:
     """The lines of the report.
 
     Args:
       readings: the finished runs.
       judged: the parts of each claim, by its letter and recipe.
+      compared: pairs of cells.
       scale: of all of them.
       pictures: names of files; those of a figure begin with its name.
     """
@@ -128,7 +139,7 @@ def markdown(readings: Readings, judged: Mapping[str, Mapping[Recipe, list[Judge
     lines += [_claim_line(claim, judged[claim.letter]) for claim in CLAIMS]
     lines += ["", "The parts of the claims:", ""]
     lines += [f"- ({claim.letter}) {part.what}; true if {_between(part.true_between)}" for claim in CLAIMS for part in claim.parts]
-    lines += ["", *_pair_lines(readings, settles=SCALES[scale].settles_claims), "## Tables and figures", "", _OF_TABLES]
+    lines += ["", *_pair_lines(compared), "## Tables and figures", "", _OF_TABLES]
     for name, artifact in ARTIFACTS.items():
         there = {recipe: runs for recipe, runs in readings.items() if set(artifact.settings) & set(runs)}
         if there:
@@ -152,11 +163,11 @@ def _time_lines(readings: Readings) -> list[str]:
     return [*lines, ""] if len(lines) > 5 else []
 
 
-def _pair_lines(readings: Readings, *, settles: bool) -> list[str]:
+def _pair_lines(compared: Comparisons) -> list[str]:
     """A table for each recipe that has a pair."""
     lines = []
-    for recipe, runs in readings.items():
-        rows = [(pair, {one.measure: one for one in compare(pair, runs, settles=settles)}) for pair in pairs()]
+    for recipe, ones in compared.items():
+        rows = [(pair, {one.measure: one for one in ones if one.pair == pair}) for pair in pairs()]
         rows = [(pair, found) for pair, found in rows if found]
         if rows:
             lines += [f"With {RECIPE_NAMES[recipe]}:", "", f"| pair | claims | {' | '.join(IN_WORDS.values())} |", "|---|---|---|---|---|"]
@@ -259,8 +270,8 @@ def _claim_rows(judged: Mapping[str, Mapping[Recipe, list[Judged]]]) -> list[dic
 _PAIR_COLUMNS = ("claims", "first", "second", "measure", "recipe", "chance", "low", "high", "better")
 
 
-def _pair_rows(readings: Readings, *, settles: bool) -> list[dict[str, Any]]:
-    found = [(recipe, one) for pair in pairs() for recipe, runs in readings.items() for one in compare(pair, runs, settles=settles)]
+def _pair_rows(compared: Comparisons) -> list[dict[str, Any]]:
+    found = [(recipe, one) for pair in pairs() for recipe, ones in compared.items() for one in ones if one.pair == pair]
     rows = []
     for recipe, one in found:
         names = (f"{setting.task} {setting.algo}" for setting in (one.pair.first, one.pair.second))

@@ -11,11 +11,10 @@ import jax.numpy as jnp
 from hindrl_jax.base.compilation import in_float32
 from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.errors import UserError, one_line
-from hindrl_jax.base.steppers import Watchable
 from hindrl_jax.core.agent import policy
 from hindrl_jax.runs.reader import Run
 from hindrl_jax.runs.spec import FILMS, FROM_PYTHON, RunSpec
-from hindrl_jax.tasks.registry import viewer
+from hindrl_jax.tasks.registry import is_drawn
 from hindrl_jax.training.result import Result
 
 
@@ -36,7 +35,7 @@ class Films:
         """
         if every < 1:
             raise UserError(f"--render-every {every} is too few: give the number of steps between two films, or leave it out")
-        if not isinstance(env, Watchable) and viewer(env) is None:
+        if not is_drawn(env):
             raise UserError(f"nothing draws {env.name}, so there is no film of it: leave out --render-every")
         if jax.process_count() > 1:
             raise UserError("with several hosts nothing is filmed along the run: leave out --render-every")

@@ -21,7 +21,6 @@ from flax.traverse_util import flatten_dict
 
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.files import disk_trouble, why_unwritable, write_text_atomically
-from hindrl_jax.base.steppers import Watchable
 from hindrl_jax.core.agent import policy
 from hindrl_jax.plotting import curves as plots
 from hindrl_jax.runs.reader import load_run
@@ -42,7 +41,7 @@ from hindrl_jax.runs.spec import (
     RunSpec,
     lost_functions,
 )
-from hindrl_jax.tasks.registry import viewer
+from hindrl_jax.tasks.registry import is_drawn
 from hindrl_jax.training.result import Result, Row
 
 
@@ -140,7 +139,7 @@ class RunWriter:
         if film:
             try:
                 run = load_run(self.path)
-                if isinstance(run.spec.env, Watchable) or viewer(run.spec.env) is not None:
+                if is_drawn(run.spec.env):
                     run.render(self.path / EPISODE)
             except UserError as error:
                 warnings.warn(f"no {EPISODE}: {error}", stacklevel=2)

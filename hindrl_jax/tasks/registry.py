@@ -14,6 +14,7 @@ from typing import Any
 
 from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.errors import UserError
+from hindrl_jax.base.steppers import Watchable
 from hindrl_jax.base.types import Array, Episodes
 from hindrl_jax.envs.cable import BringNear, CableInsertion
 from hindrl_jax.envs.grid import FixedGridPickAndPlace, GridPickAndPlace
@@ -179,6 +180,11 @@ def viewer(env: Environment) -> Any:
     """What draws this environment; None if nothing does."""
     found = task(env.name).viewer
     return importlib.import_module(found) if isinstance(found, str) else found
+
+
+def is_drawn(env: Environment) -> bool:
+    """Whether there are films of this environment: it shows itself, or something draws it."""
+    return isinstance(env, Watchable) or viewer(env) is not None
 
 
 def checked(build: Callable[[], Any]) -> Any:

@@ -14,6 +14,7 @@ from hindrl_jax.base.errors import UserError
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.runs import films
 from hindrl_jax.runs.reader import load_run
+from hindrl_jax.tasks import registry
 
 TRAIN = ["train", "--env", "FixedGridPickAndPlace", "--seed", "5", *TINY]
 
@@ -55,6 +56,6 @@ def test_refusals(tmp_path, capsys, monkeypatch):
     out = tmp_path / "run"
     refused = refusal(capsys, *TRAIN, "--render-every", "0", "--out", out)
     assert "--render-every 0 is too few: give the number of steps between two films" in refused
-    monkeypatch.setattr(films, "viewer", lambda env: None)
+    monkeypatch.setattr(registry, "viewer", lambda env: None)
     assert "nothing draws FixedGridPickAndPlace" in refusal(capsys, *TRAIN, "--render-every", "30", "--out", out)
     assert not out.exists()
