@@ -19,7 +19,7 @@ def outcomes(act: Callable[[dict[str, Any]], np.ndarray], env: gymnasium.Env, se
       seeds: of the episodes.
 
     Returns:
-      The shares of episodes that were solved at some step ("reached"), which is where ours end, and at the last ("held"), which is what papers on
+      The shares of episodes that were solved at some step ("reached"), and at the last ("held"), which is what papers on
       Fetch count.
     """
     reached, held = [], []

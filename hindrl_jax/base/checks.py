@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from types import UnionType
-from typing import Any, ClassVar, Literal, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, Literal, Union, get_args, get_origin, get_type_hints
 
 LARGEST = 2**31 - 1
 """The largest whole number that is counted to: counters are int32."""
@@ -30,7 +30,7 @@ def _matches(value: object, hint: Any) -> bool:
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Literal:
         return value in arguments
-    if origin is UnionType:
+    if origin in (Union, UnionType):
         return any(_matches(value, argument) for argument in arguments)
     if origin is tuple:
         hints = arguments[:1] * len(value) if isinstance(value, tuple) and arguments[-1] is Ellipsis else arguments
@@ -48,7 +48,7 @@ def _in_words(hint: Any) -> str:
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Literal:
         return f"one of {', '.join(map(str, arguments))}"
-    if origin is UnionType:
+    if origin in (Union, UnionType):
         return " or ".join(_in_words(argument) for argument in arguments)
     if origin is tuple:
         return f"a list, each item {_in_words(arguments[0])}" if arguments[-1] is Ellipsis else f"({', '.join(map(_in_words, arguments))})"

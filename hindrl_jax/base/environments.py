@@ -80,6 +80,11 @@ def backends_with(env: Any, ability: Callable[[Any], bool]) -> list[str]:
     return [choice for choice in choices if ability(dataclasses.replace(env, backend=choice))]
 
 
+def holds_goal(env: Environment) -> bool:
+    """Whether episodes go on where the goal is reached, to their horizon, and are solved where it is still reached at their last step."""
+    return getattr(env, "success", None) == "held"
+
+
 def compiler_options(env: Environment) -> dict[str, Any]:
     """Options that XLA needs for programs that step this environment, for `jax.jit` or `compile`; most environments need none."""
     return getattr(env, "compiler_options", {})

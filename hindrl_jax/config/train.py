@@ -130,6 +130,11 @@ class TrainConfig:
         return self.updates_per_iteration or max(1, round(self.steps_per_iteration / STEPS_PER_UPDATE))
 
     @property
+    def relative_goals(self) -> bool:
+        """Whether networks see what is left to the goal, desired less achieved, in place of the goal: where each episode has one of its own."""
+        return self.goal.behavioural_goals == "environment" and not self.quirks.achieved_goal_input
+
+    @property
     def clones_first(self) -> bool:
         """Whether something is cloned before the first gradient step of reinforcement learning: the actor, or what proposes beside it."""
         return self.bc_warm_start > 0 or self.imitation_proposal > 0

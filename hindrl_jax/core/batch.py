@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hindrl_jax.base.environments import Environment, RelabelsObservations
+from hindrl_jax.base.environments import Environment, RelabelsObservations, holds_goal
 from hindrl_jax.base.types import Array, Episodes, Transition, tree_where
 from hindrl_jax.config import BatchConfig, TrainConfig
 from hindrl_jax.core.goals import GoalTest
@@ -21,7 +21,7 @@ from hindrl_jax.core.hindsight import goal_source
 from hindrl_jax.core.randomness import uniform_index
 from hindrl_jax.core.relabel import num_relabelled, relabel, relabel_observations, reward_by_goal
 from hindrl_jax.core.replay import ReplayState, sample_episodes, sample_steps
-from hindrl_jax.core.steps import read_steps, transitions
+from hindrl_jax.core.steps import as_occupancy, read_steps, transitions
 
 REWARDED_BY_GOAL = "rewarded_by_goal"
 """The note of the replay on transitions of episodes that are rewarded for reaching their behavioural goal rather than by the environment."""
@@ -91,12 +91,16 @@ def rows_of_replay(key: Array, replay: ReplayState, rows: Rows, guidance: Guidan
             steps = relabel(key, replay, steps, rows.relabelled, source, test)
     if REWARDED_BY_GOAL in replay.notes:
         steps = reward_by_goal(steps, replay.notes[REWARDED_BY_GOAL][rows.row, rows.step] & ~steps.is_relabelled, test)
+    if holds_goal(env):
+        steps = as_occupancy(steps, config.batch.gamma)
     return transitions(steps, env.achieved_goal, config, is_demonstration=False)
 
 
 def rows_of_demonstrations(demonstrations: Episodes, rows: Array, steps: Array, env: Environment, config: TrainConfig) -> Transition:
     """Reads rows of the demonstrations, which are never relabelled: rows and steps (B,) int32 -> the batch."""
     recorded = read_steps(demonstrations, rows, steps, config.batch.n_step)
+    if holds_goal(env):  # that a demonstration ends at the goal does not say that the hand would have stayed there
+        recorded = as_occupancy(recorded.replace(terminated=jnp.zeros_like(recorded.terminated)), config.batch.gamma)
     return transitions(recorded, env.achieved_goal, config, is_demonstration=True)
 
 
@@ -113,6 +117,6 @@ def goal_test(guidance: Guidance, env: Environment, config: TrainConfig) -> Goal
         achieved_goal=env.achieved_goal,
         epsilon=guidance.epsilon,
         inclusive=not config.quirks.strict_goal_test,
-        ends_return=not config.quirks.bootstrap_past_relabelled_goals,
+        ends_return=not (config.quirks.bootstrap_past_relabelled_goals or holds_goal(env)),
         own_goals=config.goal.behavioural_goals == "environment",
     )

@@ -12,7 +12,7 @@ from hindrl_jax.base.types import Array, Episodes
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.core import goals
 from hindrl_jax.core.goals import GoalTable
-from hindrl_jax.core.inputs import InputScale, input_scale
+from hindrl_jax.core.inputs import InputScale, input_scale, seen_goal
 from hindrl_jax.core.rollout import StartTable
 
 
@@ -46,6 +46,7 @@ def guidance(demonstrations: Episodes, env: Environment, config: TrainConfig) ->
     else:
         epsilon = jnp.full(env.goal_dim, config.goal.epsilon)
     behavioural_goals, desired_goals = _behavioural_goals(demonstrations, achieved, env, config)
+    seen = seen_goal(achieved, desired_goals[:, None], config) if config.relative_goals else achieved
     keep = goals.is_visited(lengths, achieved.shape[1])
     if config.goal.epsilon_filtering:
         keep &= jax.vmap(lambda path: goals.epsilon_filter(path, epsilon))(achieved)
@@ -56,7 +57,7 @@ def guidance(demonstrations: Episodes, env: Environment, config: TrainConfig) ->
         goals=goals.goal_table(observations, achieved, keep),
         behavioural_goals=behavioural_goals,
         epsilon=epsilon,
-        scale=input_scale(observations, achieved, goals.is_visited(lengths, achieved.shape[1]), config.agent),
+        scale=input_scale(observations, seen, goals.is_visited(lengths, achieved.shape[1]), config.agent),
         starts=starts,
     )
 

@@ -21,14 +21,15 @@ class InputScale(struct.PyTreeNode, kw_only=True):
     goal_centre: Array  # (G,)
 
 
-def input_scale(observations: Array, achieved_goals: Array, is_visited: Array, config: AgentConfig) -> InputScale:
+def input_scale(observations: Array, goals: Array, is_visited: Array, config: AgentConfig) -> InputScale:
     """The mean and the standard deviation of each dimension over demonstration states; raw inputs have 0 and 1.
 
     A deviation below a tenth of the root mean square counts as that tenth: what hardly moved in the demonstrations may move elsewhere. A dimension
     that is always 0 has scale 1.
 
     Args:
-      observations, achieved_goals: (..., D) and (..., G).
+      observations: (..., D)
+      goals: (..., G), like those that networks see: what is left to the goal, or the achieved ones.
       is_visited: (...) bool, false for padding.
       config: its `input_encoding` decides.
     """
@@ -46,7 +47,7 @@ def input_scale(observations: Array, achieved_goals: Array, is_visited: Array, c
         return centre, jnp.where(scale > _LEAST_EXTENT, scale, 1.0)
 
     if config.input_encoding == "raw":
-        observation_dim, goal_dim = observations.shape[-1], achieved_goals.shape[-1]
+        observation_dim, goal_dim = observations.shape[-1], goals.shape[-1]
         return InputScale(
             observation=jnp.ones(observation_dim),
             goal=jnp.ones(goal_dim),
@@ -54,7 +55,7 @@ def input_scale(observations: Array, achieved_goals: Array, is_visited: Array, c
             goal_centre=jnp.zeros(goal_dim),
         )
     observation_centre, observation = moments(observations)
-    goal_centre, goal = moments(achieved_goals)
+    goal_centre, goal = moments(goals)
     return InputScale(observation=observation, goal=goal, observation_centre=observation_centre, goal_centre=goal_centre)
 
 
@@ -69,17 +70,18 @@ def _encode(values: Array, centre: Array, scale: Array, config: AgentConfig) -> 
     return jnp.concatenate([standardised, jnp.tanh(4.0 * values / jnp.sqrt(jnp.square(scale) + jnp.square(centre)))], axis=-1)
 
 
+def seen_goal(achieved_goal: Array, desired_goal: Array, config: TrainConfig) -> Array:
+    """The goal as networks see it: what is left to it, where each episode has one of its own; else as it is. All (..., G)."""
+    return desired_goal - achieved_goal if config.relative_goals else desired_goal
+
+
 def network_inputs(observation: Array, achieved_goal: Array, desired_goal: Array, scale: InputScale, config: TrainConfig) -> Array:
     """Joins what the networks see, along the last axis: (..., D), (..., G), (..., G) -> (..., input_dim).
 
     The multiscale encoding gives each dimension twice: standardised, for where in the task it is; and saturating around 0 in units of its root mean
     square, so that where a dimension is a distance, "exactly there" and "one step off" are far apart. Small networks blur the two else.
     """
-    observation, achieved_goal, desired_goal = (
-        _encode(observation, scale.observation_centre, scale.observation, config.agent),
-        _encode(achieved_goal, scale.goal_centre, scale.goal, config.agent),
-        _encode(desired_goal, scale.goal_centre, scale.goal, config.agent),
-    )
-    if config.quirks.achieved_goal_input:
-        return jnp.concatenate([achieved_goal, desired_goal, observation], axis=-1)
-    return jnp.concatenate([observation, desired_goal], axis=-1)
+    goals = [achieved_goal, desired_goal] if config.quirks.achieved_goal_input else [seen_goal(achieved_goal, desired_goal, config)]
+    goals = [_encode(goal, scale.goal_centre, scale.goal, config.agent) for goal in goals]
+    observation = _encode(observation, scale.observation_centre, scale.observation, config.agent)
+    return jnp.concatenate([*goals, observation] if config.quirks.achieved_goal_input else [observation, *goals], axis=-1)

@@ -60,6 +60,16 @@ def read_steps(episodes: Episodes, rows: Array, steps: Array, n_step: int) -> St
     )
 
 
+def as_occupancy(steps: Steps, gamma: Array | float) -> Steps:
+    """Rewards for being at the goal, where episodes go on there: (1 - gamma) at each step.
+
+    So returns stay in [0, 1]: who reaches the goal after t steps, and stays, has gamma^t, as where the episode ends at the goal with a reward of 1.
+    An episode that the environment itself ends at the goal counts as one that stays there.
+    """
+    stays = steps.is_last & steps.terminated[:, None]
+    return steps.replace(rewards=jnp.where(stays, 1.0, 1.0 - gamma) * steps.rewards)
+
+
 def transitions(steps: Steps, achieved_goal: Callable[[Array], Array], config: TrainConfig, *, is_demonstration: bool) -> Transition:
     """The n-step transitions of recorded or relabelled steps.
 

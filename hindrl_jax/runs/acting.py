@@ -154,6 +154,19 @@ def _checked(values: Any, dim: int, what: str, task: str) -> Array:
     return values
 
 
+def _entries_of_achieved_goal(env: Environment) -> list[int]:
+    """Which entries of an observation make up the achieved goal, (G,).
+
+    Raises:
+      UserError: if it is none of them, but computed.
+    """
+    rows = np.arange(2.0 * env.observation_dim, dtype=np.float32).reshape(2, -1)
+    first, second = np.asarray(env.achieved_goal(jnp.asarray(rows)))
+    if not (np.isin(first, rows[0]).all() and np.array_equal(first + env.observation_dim, second)):
+        raise UserError(f"the achieved goals of {env.name} are computed, which has no form in NumPy: play it by run.policy(seed)")
+    return first.astype(int).tolist()
+
+
 def numpy_form(trained: TrainedPolicy) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """What `NumpyPolicy` is made of.
 
@@ -175,11 +188,14 @@ def numpy_form(trained: TrainedPolicy) -> tuple[dict[str, np.ndarray], dict[str,
         "encoding": config.agent.input_encoding,
         "depth": len(config.agent.net_arch),
         "residual": config.agent.residual,
+        "relative_goals": config.relative_goals,
         "action_hold": trained.action_hold,
         "chunks": trained.chunks,
         "noise": trained.noise,
         "whole_actions": takes_whole_actions(env),
     }
+    if config.relative_goals:
+        facts["achieved"] = _entries_of_achieved_goal(env)
     scale = trained.policy.scale
     low, high = (np.broadcast_to(bound, (env.action_dim,)) for bound in (env.action_low, env.action_high))
     arrays = {

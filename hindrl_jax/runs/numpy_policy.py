@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-FORMAT = 1
+FORMAT = 2
 _LOG_STD_MIN, _LOG_STD_MAX = -20.0, 2.0
 _LAYER_NORM_EPSILON = 1e-6
 
@@ -72,6 +72,8 @@ class NumpyPolicy:
         if goal is None and self.goal is None:
             raise ValueError(f"{self.task} has a goal of its own in each episode: give it, as policy(observation, goal)")
         goal = _checked(self.goal if goal is None else goal, arrays["goal_scale"].size, "a goal", self.task)
+        if self._facts["relative_goals"]:
+            goal = goal - observation[..., self._facts["achieved"]]
         leading = np.broadcast_shapes(observation.shape[:-1], goal.shape[:-1])
         parts = [self._encoded("observation", observation), self._encoded("goal", goal)]
         inputs = np.concatenate([np.broadcast_to(part, (*leading, part.shape[-1])) for part in parts], axis=-1)

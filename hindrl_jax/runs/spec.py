@@ -77,12 +77,10 @@ class RunSpec:
             raise UserError(f"{where}: env_args = {env_args!r} is not usable: it must be an object of the environment's arguments")
         if not (isinstance(seeds, list) and seeds and all(type(seed) is int and 0 <= seed < 2**32 for seed in seeds)):
             raise UserError(f"{where}: seeds = {seeds!r} is not usable: it must be a list of whole numbers from 0 to {2**32 - 1}")
-        return RunSpec(
-            env=make(data["env"], **env_args),
-            config=_config_from_dict(TrainConfig, data["config"], "config", where),
-            demos=data["demos"],
-            seeds=tuple(seeds),
-        )
+        env, config = make(data["env"], **env_args), _config_from_dict(TrainConfig, data["config"], "config", where)
+        if config.relative_goals and hasattr(env, "success") and "success" not in env_args:
+            raise UserError(f"{where} is of a version whose networks saw goals of {env.name} otherwise, so they would mistake them: train again")
+        return RunSpec(env=env, config=config, demos=data["demos"], seeds=tuple(seeds))
 
 
 def read_spec(path: Path) -> RunSpec:

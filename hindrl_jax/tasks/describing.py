@@ -40,6 +40,8 @@ class Description:
     horizon: int | None
     goal_tolerance: float | None
     success: SuccessRule
+    goes_on_at_goal: bool
+    """Whether it has goals, and says that reaching one does not end an episode."""
     render_fps: int
 
 
@@ -127,6 +129,7 @@ def _described(gymnasium_id: str, env: Any) -> Description:
         horizon=env.spec.max_episode_steps,
         goal_tolerance=float(threshold) / goal_dim**0.5 if is_number and gives_goals else None,
         success=success,
+        goes_on_at_goal=gives_goals and _goes_on(env, np.asarray(begun[0]["desired_goal"]), taken[4]),
         render_fps=env.metadata.get("render_fps", 25),
     )
 
@@ -170,6 +173,12 @@ def _reward_at_goal(gymnasium_id: str, env: Any, goal: np.ndarray, info: dict[st
     if not np.isfinite(reward):
         raise UserError(f"{gymnasium_id} does not say when a goal is reached: compute_reward gives {reward} for the goal itself")
     return reward
+
+
+def _goes_on(env: Any, goal: np.ndarray, info: dict[str, Any]) -> bool:
+    """Whether an episode goes on where its goal (G,) is reached, as the interface of Gymnasium-Robotics says it; False where nothing says it."""
+    compute_terminated = getattr(env.unwrapped, "compute_terminated", None)
+    return compute_terminated is not None and not compute_terminated(goal, goal, info)
 
 
 def _check_observation(gymnasium_id: str, parts: dict[str, Box], observation: Any) -> None:

@@ -8,8 +8,11 @@ States cannot be written down: episodes begin where the environment lets them be
   * Here the observation is [observation, achieved_goal], and the goal of an episode is the desired goal of its first observation. Networks see the
     goal beside the observation, so that it can be another in hindsight.
   * The reward is 1 where the environment says that the goal is reached (info["is_success"] or info["success"], else a reward as high as that of
-    reaching the goal exactly), else 0, whatever the environment's own is. The episode ends there, as in all our tasks, also where the environment
-    itself would go on. So success means that the goal was reached at some step, not that it was held until the last one.
+    reaching the goal exactly), else 0, whatever the environment's own is.
+  * With `success` = "held" an episode goes on to its horizon, and is a success where the goal is reached at its last step, which is what papers on
+    the Fetch tasks count; each step there is worth 1 - gamma (`core.steps.as_occupancy`). With "reached" an episode ends, a success, where the goal
+    is first reached, also where the environment itself would go on. By default it is "held" where the environment says that reaching a goal ends no
+    episode (`compute_terminated`, of Gymnasium-Robotics).
   * `goal_tolerance` is the half-width of the largest box within the environment's ball, where it has one (`distance_threshold`). Goals in hindsight
     count as reached within a box, so they are never easier than the environment's own.
 
@@ -52,7 +55,7 @@ class GymnasiumEnv:
 
     name: ClassVar[str]
     id: ClassVar[str]
-    interchangeable: ClassVar[tuple[str, ...]] = ("vectorization", "achieved_goal_indices", "success_reward")
+    interchangeable: ClassVar[tuple[str, ...]] = ("vectorization", "achieved_goal_indices", "success_reward", "success")
     """Arguments in which demonstrations may differ from the environment that learns from them."""
 
     horizon: int | None = None
@@ -66,6 +69,10 @@ class GymnasiumEnv:
     success_reward: float | None = None
     """Of flat observations, where no info says when the task is solved: the least reward that does (default: any above 0 that ends an episode)."""
 
+    success: Literal["reached", "held"] | None = None
+    """Of goals: to reach one, which ends the episode, or to be there at its last step (default: held where the environment says that it ends no
+    episode)."""
+
     def __post_init__(self) -> None:
         for name in ("make_kwargs", "achieved_goal_indices"):  # files have lists in their place
             if isinstance(getattr(self, name), list):
@@ -76,8 +83,12 @@ class GymnasiumEnv:
             if self.description.horizon is None:
                 raise UserError(f"{self.name} sets no limit to the length of an episode: give a horizon")
             object.__setattr__(self, "horizon", self.description.horizon)
+        if self.success is None:
+            object.__setattr__(self, "success", "held" if self.description.goes_on_at_goal else "reached")
         if self.achieved_goal_indices or self.success_reward is not None:
             self._check_flat()
+        if self.success == "held" and not self.gives_goals:
+            raise UserError(f"success = held is for environments that give goals, which {self.name} does not: leave it out")
 
     def _check_flat(self) -> None:
         """Makes sure that the options of flat observations can be had."""

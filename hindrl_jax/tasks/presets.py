@@ -17,6 +17,7 @@ they are and from the demonstrations:
     relabelling            where episodes have goals of their own, or parameters of the task in their observations, half of the replay rows, with
                            goals of demonstrations and rollouts; where all aim at the same, a fifth, with goals of demonstrations: there, other
                            goals are not what is to be learnt, and take rows of the batch
+    the goal as an input   what is left to it, desired less achieved, where episodes have goals of their own; else the goal
     target entropy         counts per action dimension
     random steps           one horizon in each environment
 

@@ -15,6 +15,7 @@ from gymnasium import logger
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from gymnasium.vector.async_vector_env import AsyncState
 
+from hindrl_jax.base.environments import holds_goal
 from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.base.steppers import Outcome, SimulationFailed
 from hindrl_jax.tasks.describing import GOAL_KEYS, is_whole, played_actions, quoted
@@ -40,7 +41,7 @@ class Simulators:
             os.environ["MUJOCO_GL"] = importlib.import_module("hindrl_jax.envs.panda.opengl").opengl_library()
         make = functools.partial(make_single, env.id, env.arguments, env.horizon, render_mode)
         if num_held > 1:
-            make = functools.partial(make_held, make, num_held, env.success_rule)
+            make = functools.partial(make_held, make, num_held, None if holds_goal(env) else env.success_rule)
         mode = dict(autoreset_mode=AutoresetMode.DISABLED)  # an episode that has reached its goal is to end, though its environment does not say so
         self._steps, self._has_failed = np.zeros(num_envs, int), False
         with self._failure("while it was made"):
@@ -125,7 +126,8 @@ class Simulators:
             self._observed, rewards, terminated, truncated, info = self._envs.step(played.astype(space.dtype))
             success = self.env.success_rule.solved(info, rewards, terminated)
         next_observation, _ = self.now()
-        terminated = terminated | success
+        if not holds_goal(self.env):
+            terminated = terminated | success
         ended = terminated | truncated
         if autoreset and ended.any():
             with self._failure(f"{moment}, when the next one was to begin"):

@@ -120,16 +120,17 @@ def record_gymnasium(env: Watchable, policy: Demonstrator, num_demos: int, *, se
     with contextlib.closing(env.watched(with_pictures=False)) as stepper:
         observation, goal = stepper.begin(rng.integers(2**32, size=1))
         for _ in range(max_attempts):
-            observations, actions, ended = [observation], [], False
+            observations, actions, solved, ended = [observation], [], [], False
             while not ended:
                 action = _checked(policy(stepper.raw_observation(), rng), env)
                 actions.append(played_action(action))
                 outcome = stepper.step(action[None])
                 observations.append(outcome.next_observation)
+                solved.append(outcome.success[0])
                 ended = outcome.ended[0]
             if outcome.success[0]:
                 reached = np.asarray(env.achieved_goal(outcome.next_observation)) if goal is None else goal
-                kept.append(_demonstration(env, np.concatenate(observations), np.stack(actions), reached[0]))
+                kept.append(_demonstration(env, np.concatenate(observations), np.stack(actions), np.array(solved), reached[0]))
             observation, goal = outcome.observation, outcome.desired_goal
             if len(kept) == num_demos:
                 return jax.tree.map(lambda *leaves: np.stack(leaves), *kept)
@@ -151,8 +152,8 @@ def _checked(action: Any, env: Environment) -> np.ndarray:
     return action
 
 
-def _demonstration(env: HostStepped, observations: np.ndarray, actions: np.ndarray, goal: np.ndarray) -> Episodes:
-    """A solved episode of L steps, padded: observations (L + 1, D), actions (L, A) in the environment's own units, goal (G,)."""
+def _demonstration(env: HostStepped, observations: np.ndarray, actions: np.ndarray, solved: np.ndarray, goal: np.ndarray) -> Episodes:
+    """A solved episode of L steps, padded: observations (L + 1, D), actions (L, A) in the environment's own units, solved (L,) bool, goal (G,)."""
     length = len(actions)
 
     def padded(rows: np.ndarray, size: int) -> np.ndarray:
@@ -161,7 +162,7 @@ def _demonstration(env: HostStepped, observations: np.ndarray, actions: np.ndarr
     return Episodes(
         observations=padded(observations, env.horizon + 1),
         actions=padded(np.asarray(action_from_env(jnp.asarray(actions), env)), env.horizon),
-        rewards=np.eye(env.horizon, dtype=np.float32)[length - 1],
+        rewards=np.append(solved, np.zeros(env.horizon - length)).astype(np.float32),
         lengths=np.int32(length),
         terminated=np.bool_(True),
         desired_goals=goal,

@@ -119,6 +119,13 @@ def test_behavioural_goals_may_be_those_that_the_demonstrations_came_with():
     assert data.demonstrations.desired_goals.tolist() == [[6.0], [7.0]]
 
 
+def test_where_goals_are_the_environments_own_their_scale_is_that_of_what_is_left_to_them():
+    demonstrations = corridor_demonstrations(TWO_SPEEDS, env=ENV).replace(desired_goals=jnp.array([[6.0], [7.0]]))
+    scale = guidance(demonstrations, ENV, TrainConfig(goal=GoalConfig(behavioural_goals="environment"))).scale
+    left = [6.0, 5.0, 4.0, 3.0, 2.0, 7.0, 5.0, 3.0]
+    np.testing.assert_allclose([*scale.goal_centre, *scale.goal], [np.mean(left), np.std(left)], rtol=1e-6)
+
+
 def test_last_goals_may_be_excluded():
     assert goals_of(guidance_of(quirks=QuirksConfig(exclude_last_goal=True)).goals) == [0.0, 1.0, 2.0, 3.0, 0.0, 2.0]
 

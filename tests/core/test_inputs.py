@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hindrl_jax.config import AgentConfig, QuirksConfig, TrainConfig
+from hindrl_jax.config import AgentConfig, GoalConfig, QuirksConfig, TrainConfig
 from hindrl_jax.core import agent as agents
 from hindrl_jax.core.inputs import InputScale, input_scale, network_inputs
 
@@ -35,6 +35,16 @@ def test_network_inputs_by_hand(encoding, achieved_goal_input, expected):
     np.testing.assert_allclose(unbatched, expected, rtol=1e-6)
     state = jax.eval_shape(lambda key: agents.init(key, scale, config, action_dim=1), jax.random.key(0))
     assert state.actor["params"]["Dense_0"]["kernel"].shape == (len(expected), 3)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "expected"), [("raw", [1.0, 2.0, -3.0]), ("multiscale", [0.5, -0.5, *AROUND_0, -2 / 3, -np.tanh(12 / 37**0.5)])]
+)
+def test_goals_of_the_environments_own_are_seen_from_where_one_is(encoding, expected):
+    # 5 less 8 is -3; less 1 over 6 it is -2/3.
+    scale = InputScale(observation=jnp.array([2.0, 4.0]), goal=jnp.array([6.0]), observation_centre=jnp.array([0.0, 4.0]), goal_centre=jnp.ones(1))
+    config = TrainConfig(agent=AgentConfig(input_encoding=encoding), goal=GoalConfig(behavioural_goals="environment"))
+    np.testing.assert_allclose(network_inputs(jnp.array([1.0, 2.0]), jnp.array([8.0]), jnp.array([5.0]), scale, config), expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("padding", [7.0, np.nan])

@@ -12,7 +12,7 @@ from hindrl_jax.base.types import Episodes
 from hindrl_jax.config import BatchConfig, QuirksConfig, TrainConfig
 from hindrl_jax.core.goals import GoalTest
 from hindrl_jax.core.relabel import reward_by_goal
-from hindrl_jax.core.steps import read_steps, transitions
+from hindrl_jax.core.steps import as_occupancy, read_steps, transitions
 
 
 @pytest.mark.parametrize(
@@ -49,6 +49,31 @@ def test_two_step_returns_by_hand(terminated, quirks, discounts):
     np.testing.assert_allclose(batch.action[:, 0], [0.1, 0.2, 0.3])
     assert batch.is_demonstration.tolist() == [True] * 3
     assert batch.is_relabelled.tolist() == [False] * 3
+
+
+@pytest.mark.parametrize(
+    ("terminated", "rewards", "discounts"),
+    [(False, [0.25, 0.75, 0.5], [0.25, 0.25, 0.5]), (True, [0.25, 1.0, 1.0], [0.25, 0.0, 0.0])],
+)
+def test_returns_where_the_goal_is_to_be_held_by_hand(terminated, rewards, discounts):
+    # One episode through the states 10, 11, 12, 13, the goal reached in the last two. Gamma is 1/2, n is 2, so each step at the goal is worth 1/2.
+    #   from step 0: 0 + 1/2 * 1/2 = 1/4, up to state 12
+    #   from step 1: 1/2 + 1/2 * 1/2 = 3/4, up to state 13; who stays there for ever has 1/2 + 1/4 + ... = 1
+    #   from step 2: 1/2
+    # An episode that the environment ends at the goal is worth 1 there: 1/2 + 1/2 * 1 from step 1, and 1 from step 2.
+    episodes = Episodes(
+        observations=jnp.array([[[10.0], [11.0], [12.0], [13.0]]]),
+        actions=jnp.zeros((1, 3, 1)),
+        rewards=jnp.array([[0.0, 1.0, 1.0]]),
+        lengths=jnp.array([3]),
+        terminated=jnp.array([terminated]),
+        desired_goals=jnp.array([[12.5]]),
+    )
+    config = TrainConfig(batch=BatchConfig(gamma=0.5, n_step=2))
+    steps = as_occupancy(read_steps(episodes, jnp.zeros(3, jnp.int32), jnp.arange(3), 2), 0.5)
+    batch = transitions(steps, lambda observation: observation, config, is_demonstration=False)
+    assert batch.reward.tolist() == rewards
+    assert batch.discount.tolist() == discounts
 
 
 def transition_twin(episodes, row, step, goal, *, by_goal, epsilon, config):

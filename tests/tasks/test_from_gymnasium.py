@@ -8,7 +8,7 @@ import pytest
 from point_env import SPEED
 
 import hindrl_jax as hindrl
-from hindrl_jax.base.environments import Environment
+from hindrl_jax.base.environments import Environment, holds_goal
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.tasks import describing
 from hindrl_jax.tasks.simulators import Simulators
@@ -61,6 +61,8 @@ def test_arguments_go_to_gymnasium_and_survive_the_way_through_a_file():
         (POINT, {"speed": 3}, "failed: .*unexpected keyword argument 'speed'"),
         (POINT, {"make_kwargs": ("says",)}, "NAME=VALUE"),
         (POINT, {"vectorization": "threads"}, "vectorization"),
+        (POINT, {"success": "kept"}, "success"),
+        ("gymnasium:Pendulum-v1", {"success": "held"}, "is for environments that give goals"),
         (POINT, {"horizon": 0}, "at least 1"),
     ],
 )
@@ -90,6 +92,31 @@ def test_an_episode_ends_at_its_goal_with_its_true_last_observation(simulators, 
         observation, goal = outcome.observation, outcome.desired_goal
     assert num_solved >= 4
     assert outcome.truncated.tolist() == [False, True, False]  # the second, at the horizon
+
+
+@pytest.mark.parametrize(("arguments", "holds"), [({}, False), ({"ends": False}, True), ({"ends": True}, False), ({"success": "held"}, True)])
+def test_a_goal_is_to_be_held_where_the_environment_goes_on_there_or_it_is_asked_for(arguments, holds):
+    env = hindrl.make(POINT, **arguments)
+    assert (env.success == "held", holds_goal(env)) == (holds, holds)
+    assert hindrl.make(env.name, **dataclasses.asdict(env)) == env
+
+
+@pytest.mark.parametrize("num_held", [1, 4])
+def test_where_the_goal_is_to_be_held_only_the_last_step_counts(simulators, num_held):
+    """The first point stays at its goal, the second goes beyond when it was there; both episodes last for their 10 steps."""
+    two = simulators(hindrl.make(POINT, success="held"), 2, num_held=num_held)
+    observation, goal = two.begin(np.array([4, 5]))
+    success = []
+    for _ in range(-(-10 // num_held)):
+        away = any(step[1] for step in success)
+        wish = np.clip((goal - observation[:, 3:]) / SPEED / num_held, -1, 1) * 2
+        outcome = two.step(np.where([[False], [away]], 2.0, wish), autoreset=False)
+        assert not outcome.terminated.any()
+        success.append(outcome.success.tolist())
+        observation = outcome.observation
+    assert outcome.truncated.all()
+    assert [1, 1] in success
+    assert success[-1] == [1, 0]
 
 
 @pytest.mark.parametrize("says", ["is_success", "reward"])

@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny
@@ -14,7 +15,7 @@ from toy_env import corridor_demonstrations
 import hindrl_jax as hindrl
 from hindrl_jax import cli
 from hindrl_jax.base.errors import UserError
-from hindrl_jax.core.batch import REWARDED_BY_GOAL
+from hindrl_jax.core.batch import REWARDED_BY_GOAL, rows_of_demonstrations
 from hindrl_jax.core.hindsight import NEARBY_GOAL
 from hindrl_jax.runs.checkpoints import Checkpoints
 from hindrl_jax.tasks.simulators import Simulators
@@ -51,6 +52,39 @@ def test_demonstrations_are_what_the_policy_did_up_to_the_goal(env, demonstratio
     assert demonstrations.terminated.all()
     again = record_gymnasium(env, to_goal, 5, seed=1)
     np.testing.assert_array_equal(again.observations, demonstrations.observations)
+
+
+def test_demonstrations_that_stay_at_their_goal_serve_where_the_episode_ends_there(env, demonstrations, tmp_path):
+    holds = dataclasses.replace(env, success="held")
+    recorded = record_gymnasium(holds, to_goal, 5, seed=1)
+    assert recorded.lengths.tolist() == [10] * 5
+    assert recorded.rewards[:, -1].all()
+    assert (np.diff(recorded.rewards, axis=1) >= 0.0).all()  # none leaves its goal
+    hindrl.save_demonstrations(tmp_path / "demos.hdf5", recorded, env=holds, env_args=dataclasses.asdict(holds))
+    np.testing.assert_array_equal(hindrl.load_demonstrations(tmp_path / "demos.hdf5", holds).rewards, recorded.rewards)
+    cut = hindrl.load_demonstrations(tmp_path / "demos.hdf5", env)
+    for i, length in enumerate(cut.lengths):
+        assert length == np.argmax(recorded.rewards[i]) + 1
+        np.testing.assert_array_equal(cut.observations[i, : length + 1], recorded.observations[i, : length + 1])
+        np.testing.assert_array_equal(cut.rewards[i], np.arange(10) == length - 1)
+
+
+def test_where_the_goal_is_to_be_held_episodes_go_on_and_values_stay_below_one(env):
+    """The demonstrations end at their goals, which is not the end of an episode here."""
+    holds = dataclasses.replace(env, success="held")
+    result = hindrl.fit(holds, record_gymnasium(env, to_goal, 5, seed=1), CONFIG)
+    replay = jax.device_get(result.state.replay)
+    assert set(replay.episodes.lengths[0].tolist()) <= {0, 10}
+    assert not replay.episodes.terminated.any()
+    assert replay.episodes.rewards[0, :, :-1].any()
+    assert {row.episode_length for row in result.rows} == {10.0}
+    recorded = jax.tree.map(jnp.asarray, record_gymnasium(holds, to_goal, 5, seed=1))
+    rows, steps = jnp.zeros(10, jnp.int32), jnp.arange(10)
+    config = with_batch(CONFIG, gamma=0.5, n_step=1)
+    for table in (recorded, recorded.replace(terminated=jnp.zeros(5, bool))):
+        batch = rows_of_demonstrations(table, rows, steps, holds, config)
+        np.testing.assert_allclose(batch.reward, 0.5 * recorded.rewards[0])
+        np.testing.assert_allclose(batch.discount, 0.5)
 
 
 def test_a_policy_that_reaches_nothing_is_told_so(env):
