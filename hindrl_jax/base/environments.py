@@ -50,8 +50,8 @@ class Environment(Protocol):
     def achieved_goal(self, observation: Array) -> Array:
         """The projection Phi of thesis section 2.2: observations (..., D) -> achieved goals (..., G)."""
 
-    def task_goal(self) -> Array:
-        """(G,) one fixed goal that stands for "the task is solved"."""
+    def task_goal(self) -> Array | None:
+        """(G,) one fixed goal that stands for "the task is solved"; None where the environment knows of none."""
 
 
 @runtime_checkable

@@ -21,8 +21,8 @@ class GoalConfig:
     epsilon_filtering: bool = False
     """Drop demonstration goals that lie within epsilon of the last kept one (thesis algorithm 6, Smooth HinDRL)."""
     behavioural_goals: Literal["final_demonstration_states", "task", "environment"] = "final_demonstration_states"
-    """Goal of a rollout: the end of a random demonstration (thesis algorithm 5), the task's one constant goal (original code), or, where episodes
-    come with goals of their own (Gymnasium's environments), that goal."""
+    """Goal of a rollout: the end of a random demonstration (thesis algorithm 5), the task's one constant goal (original code; where the environment
+    knows of none, the mean of these ends), or, where episodes come with goals of their own (Gymnasium's environments), that goal."""
     achieved_goal_ratio: float = 0.0
     """Share of training episodes with another behavioural goal: a state reached earlier in training, whatever the task (thesis chapter 6). They
     are rewarded, when drawn, for reaching that goal. Evaluations never have one."""

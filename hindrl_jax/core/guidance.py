@@ -67,11 +67,11 @@ def _behavioural_goals(demonstrations: Episodes, achieved: Array, env: Environme
     if config.goal.behavioural_goals == "environment":
         desired_goals = demonstrations.desired_goals
         return GoalTable(goals=desired_goals, count=jnp.asarray(desired_goals.shape[0])), desired_goals
-    if config.goal.behavioural_goals == "task":
-        table = goals.constant_goal(env.task_goal())
-        return table, jnp.broadcast_to(table.goals, (demonstrations.lengths.shape[0], env.goal_dim))
     table = goals.final_goals(achieved, demonstrations.lengths)
-    return table, table.goals
+    if config.goal.behavioural_goals == "task":
+        known = env.task_goal()
+        table = goals.constant_goal(jnp.mean(table.goals, axis=0) if known is None else known)
+    return table, jnp.broadcast_to(table.goals, (demonstrations.lengths.shape[0], env.goal_dim))
 
 
 def _with_quirks(demonstrations: Episodes, env: Environment, config: TrainConfig) -> Episodes:

@@ -18,8 +18,9 @@ States cannot be written down: episodes begin where the environment lets them be
 
 **Flat.** Observations are vectors, and a sparse reward or a success flag says when the task is solved.
 
-  * The achieved goal is the observation, or the part of it that `achieved_goal_indices` names. Episodes come without goals: rollouts aim at the ends
-    of demonstrations, and goals in hindsight count as reached within epsilon, which follows from the demonstrations (thesis eq. 4.7 and 4.8).
+  * The achieved goal is the observation, or the part of it that `achieved_goal_indices` names. Episodes come without goals, and all
+    aim at one, the mean of the demonstrations' ends. Those that begin otherwise may have to end otherwise, so one demonstration's end is no goal for
+    all. Goals in hindsight count as reached within epsilon, which follows from the demonstrations (thesis eq. 4.7 and 4.8).
   * The reward is 1 where the task is solved, else 0, and the episode ends there. It is solved where the info says so, info["is_success"] or
     info["success"]; where the first step's info has neither, at a step with a reward of at least `success_reward`; and where that is not given, at a
     step that ends the episode (terminated) with a reward above 0, unless that step's info says otherwise. An episode that the environment ends
@@ -171,8 +172,8 @@ class GymnasiumEnv:
             return observation[..., self.description.observation_dim :]
         return observation[..., np.array(self.achieved_goal_indices)] if self.achieved_goal_indices else observation
 
-    def task_goal(self) -> Array:
-        raise UserError(f"{self.name} has no one goal for all episodes: choose other behavioural goals")
+    def task_goal(self) -> None:
+        """None: that the task is solved is said otherwise."""
 
     def stepper(self, num_envs: int, *, num_held: int = 1) -> Simulators:
         return Simulators(self, num_envs, num_held=num_held)
@@ -197,5 +198,11 @@ def make(name: str, arguments: dict[str, Any]) -> GymnasiumEnv:
     """Builds an environment; arguments that are not fields of `GymnasiumEnv` are for gymnasium.make."""
     fields = {field.name for field in dataclasses.fields(GymnasiumEnv)}
     own = {key: value for key, value in arguments.items() if key in fields}
-    others = tuple(f"{key}={json.dumps(value)}" for key, value in arguments.items() if key not in fields)
+    others = tuple(_as_typed(key, value) for key, value in arguments.items() if key not in fields)
     return environment_class(name)(**own | {"make_kwargs": (*own.get("make_kwargs", ()), *others)})
+
+
+def _as_typed(name: str, value: Any) -> str:
+    """NAME=VALUE as one would type it, so that it is the same from Python and from the command line: a word as it is, all else in JSON."""
+    plain = f"{name}={value}"
+    return plain if isinstance(value, str) and arguments_of((plain,)) == {name: value} else f"{name}={json.dumps(value)}"

@@ -12,8 +12,8 @@ they are and from the demonstrations:
     updates_per_iteration  one gradient step for every 4 environment steps
     input scales, epsilon  from the demonstrations (`core.inputs.input_scale`, thesis eq. 4.7); epsilon is the tolerance of the environment where
                            episodes come with its goals and it tells one
-    behavioural goals      those that episodes come with; else the task's one goal where hindsight relabels observations; else the ends of
-                           demonstrations (thesis algorithm 5)
+    behavioural goals      those that episodes come with; else the task's one goal where hindsight relabels observations, and the mean of the
+                           demonstrations' ends where the environment knows nothing of goals; else the ends of demonstrations (thesis algorithm 5)
     relabelling            where episodes have goals of their own, or parameters of the task in their observations, half of the replay rows, with
                            goals of demonstrations and rollouts; where all aim at the same, a fifth, with goals of demonstrations: there, other
                            goals are not what is to be learnt, and take rows of the batch
@@ -117,7 +117,8 @@ def _goals(env: Environment) -> GoalConfig:
     if _gives_goals(env):
         tolerance = getattr(env, "goal_tolerance", None)
         return GoalConfig(behavioural_goals="environment", epsilon=None if tolerance is None else _rounded_down(np.min(tolerance)))
-    return GoalConfig(behavioural_goals="task" if isinstance(env, RelabelsObservations) else "final_demonstration_states")
+    one_goal = isinstance(env, RelabelsObservations) or env.task_goal() is None
+    return GoalConfig(behavioural_goals="task" if one_goal else "final_demonstration_states")
 
 
 def _rounded_down(value: float) -> float:

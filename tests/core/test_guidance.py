@@ -112,6 +112,13 @@ def test_behavioural_goal_may_be_the_one_of_the_task():
     assert data.demonstrations.desired_goals.tolist() == [[3.0], [3.0]]
 
 
+def test_where_nobody_knows_the_goal_it_is_the_mean_of_where_the_demonstrations_end():
+    env = type("Unknown", (Corridor,), {"task_goal": lambda self: None})(horizon=5, width=3.0)
+    data = guidance(corridor_demonstrations((1.0, 2.0, 1.5), env=ENV), env, TrainConfig(goal=GoalConfig(behavioural_goals="task")))
+    assert goals_of(data.behavioural_goals) == [pytest.approx((4.0 + 4.0 + 4.5) / 3)]
+    assert data.demonstrations.desired_goals.tolist() == [goals_of(data.behavioural_goals)] * 3
+
+
 def test_behavioural_goals_may_be_those_that_the_demonstrations_came_with():
     demonstrations = corridor_demonstrations(TWO_SPEEDS, env=ENV).replace(desired_goals=jnp.array([[6.0], [7.0]]))
     data = guidance(demonstrations, ENV, TrainConfig(goal=GoalConfig(behavioural_goals="environment")))

@@ -36,7 +36,7 @@ def test_it_is_an_environment_without_goals_whose_observation_is_the_achieved_go
     observations = jnp.arange(8.0).reshape(2, 4)
     np.testing.assert_array_equal(env.achieved_goal(observations), observations)
     goal = hindrl.preset(env=env).goal
-    assert (goal.behavioural_goals, goal.epsilon) == ("final_demonstration_states", None)
+    assert (goal.behavioural_goals, goal.epsilon) == ("task", None)
 
 
 @pytest.mark.parametrize("indices", [(1,), [1], (2, 0)])
