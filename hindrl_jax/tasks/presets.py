@@ -14,9 +14,10 @@ they are and from the demonstrations:
                            episodes come with its goals and it tells one
     behavioural goals      those that episodes come with; else the task's one goal where hindsight relabels observations, and the mean of the
                            demonstrations' ends where the environment knows nothing of goals; else the ends of demonstrations (thesis algorithm 5)
-    relabelling            where episodes have goals of their own, or parameters of the task in their observations, half of the replay rows, with
-                           goals of demonstrations and rollouts; where all aim at the same, a fifth, with goals of demonstrations: there, other
-                           goals are not what is to be learnt, and take rows of the batch
+    relabelling            where episodes have goals of their own, four fifths of the replay rows, as in HER (Andrychowicz et al., 2017), and where
+                           they have parameters of the task in their observations half of them, with goals of demonstrations and rollouts; where
+                           all aim at the same, a fifth, with goals of demonstrations: there, other goals are not what is to be learnt, and take
+                           rows of the batch
     the goal as an input   what is left to it, desired less achieved, where episodes have goals of their own; else the goal
     target entropy         counts per action dimension
     random steps           one horizon in each environment
@@ -96,20 +97,16 @@ def _default(algo: Algorithm, env: Environment) -> TrainConfig:
 
 
 def _batch(env: Environment) -> BatchConfig:
-    return _MANY_TASKS if _has_many_tasks(env) else BatchConfig()
-
-
-_MANY_TASKS = BatchConfig(relabelled_per_original=1.0, hindrl_sampling_strategy="joint_union")
-"""Relabelling where hindsight turns an episode into one of another task that is to be learnt, too."""
+    """Where hindsight turns an episode into one of another task that is to be learnt, too, more is relabelled, and with goals of both sources."""
+    if _gives_goals(env):
+        return BatchConfig(relabelled_per_original=4.0, hindrl_sampling_strategy="joint_union")
+    if isinstance(env, RelabelsObservations):
+        return BatchConfig(relabelled_per_original=1.0, hindrl_sampling_strategy="joint_union")
+    return BatchConfig()
 
 
 def _gives_goals(env: Environment) -> bool:
     return can_step_on_host(env) and env.gives_goals
-
-
-def _has_many_tasks(env: Environment) -> bool:
-    """Whether episodes have goals, or parameters in their observations, of their own; else all of them aim at what the demonstrations end in."""
-    return _gives_goals(env) or isinstance(env, RelabelsObservations)
 
 
 def _goals(env: Environment) -> GoalConfig:

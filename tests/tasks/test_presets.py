@@ -136,7 +136,7 @@ RLPD = {
         ("tqcfd", "FixedGridPickAndPlace", 0.0),
         ("hindrl", "FixedGridPickAndPlace", 0.25),
         ("hindrl", "ParameterizedReach", 1.0),
-        ("hindrl", "gymnasium:FetchReach-v4", 1.0),
+        ("hindrl", "gymnasium:FetchReach-v4", 4.0),
     ],
 )
 def test_rlpd_is_what_its_paper_says(algo, env, relabelled):
@@ -165,7 +165,8 @@ def test_there_is_one_recipe_and_what_differs_follows_from_what_an_environment_d
     recipes = {name: flat(preset("hindrl", env=name)) for name in TASKS}
     grid = recipes["GridPickAndPlace"]
     differences = {name: {field: value for field, value in recipe.items() if value != grid[field]} for name, recipe in recipes.items()}
-    many_tasks = {"relabelled_per_original": 1.0, "hindrl_sampling_strategy": "joint_union"}
+    both = {"hindrl_sampling_strategy": "joint_union"}
+    own_goals = {"behavioural_goals": "environment", "epsilon": 0.02886, "relabelled_per_original": 4.0}  # 0.05 over the root of 3
     assert preset("hindrl", env="GridPickAndPlace") == TrainConfig()
     assert differences == {
         "GridPickAndPlace": {},
@@ -173,8 +174,8 @@ def test_there_is_one_recipe_and_what_differs_follows_from_what_an_environment_d
         "FixedParameterizedReach": {},
         "BringNear": {},
         "CableInsertion": {},
-        "ParameterizedReach": many_tasks | {"behavioural_goals": "task"},
-        "gymnasium:FetchReach-v4": many_tasks | {"behavioural_goals": "environment", "epsilon": 0.02886},  # 0.05 over the root of 3
+        "ParameterizedReach": both | {"behavioural_goals": "task", "relabelled_per_original": 1.0},
+        "gymnasium:FetchReach-v4": both | own_goals,
     }
     assert preset("tqcfd", env="ParameterizedReach").batch.relabelled_per_original == 0.0
 
