@@ -107,7 +107,7 @@ class Browser:
     def resize(self, width: int, height: int) -> None:
         """Makes the window as large as this many pixels, and waits until the page has been drawn anew."""
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
-        self.evaluate("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        self.evaluate("new Promise(done => { requestAnimationFrame(() => requestAnimationFrame(done)); setTimeout(done, 1000); })")
 
     def open(self, address: str) -> None:
         """Shows a page, and waits until it is loaded."""

@@ -235,7 +235,7 @@ def test_demonstrations_are_kept_next_to_the_checkpoints(tmp_path, demonstration
 
 
 def test_a_loss_that_is_not_finite_stops_the_run(demonstrations):
-    hopeless = dataclasses.replace(CLONING, agent=dataclasses.replace(CLONING.agent, learning_rate=1e38))
+    hopeless = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, learning_rate=1e38))
     with pytest.raises(experiment.Diverged, match=r"of seed 3 is (nan|inf) after \d+ environment steps and \d+ updates: try a lower learning_rate"):
         fit(demonstrations, hopeless)
 
