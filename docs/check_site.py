@@ -25,6 +25,7 @@ from urllib.parse import unquote, urldefrag, urlparse
 
 SITE = Path(__file__).parent.parent / "site"
 WIDTHS = {"laptop": 1366, "phone": 390}  # pixels
+_HEIGHT = 900
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 _PATIENCE = 30.0  # seconds
 
@@ -103,9 +104,13 @@ class Browser:
         os.write(self._write, json.dumps(message).encode() + b"\0")
         return self._wait(lambda answer: answer.get("id") == number)["result"]
 
-    def open(self, address: str, width: int, height: int) -> None:
-        """Shows a page, and waits until it is loaded."""
+    def resize(self, width: int, height: int) -> None:
+        """Makes the window as large as this many pixels, and waits until the page has been drawn anew."""
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        self.evaluate("new Promise(done => { requestAnimationFrame(() => requestAnimationFrame(done)); setTimeout(done, 1000); })")
+
+    def open(self, address: str) -> None:
+        """Shows a page, and waits until it is loaded."""
         self.events.clear()
         self.call("Page.navigate", url=address)
         if not any(event.get("method") == "Page.loadEventFired" for event in self.events):
@@ -208,19 +213,22 @@ def check(
             for page in pages:
                 name = page.relative_to(site).as_posix()
                 report.pages += 1
+                browser.resize(WIDTHS["laptop"], _HEIGHT)
+                browser.open(page.as_uri())
                 for device, width in WIDTHS.items():
-                    browser.open(page.as_uri(), width, 900)
+                    browser.resize(width, _HEIGHT)
                     seen = browser.evaluate(_LOOK)
                     report.overflowing += [f"{name}, {device}: outside the page: {one}" for one in seen["outside"]]
                     if device == "laptop":
                         report.overflowing += [f"{name}, {device}: has to be scrolled: {one}" for one in seen["scrolled"]]
-                    report.missing_pictures += [f"{name}: {one}" for one in seen["pictures"]]
-                    report.console_errors += [f"{name}: {one}" for one in browser.errors()]
                     if pictures is not None:
                         _save_picture(browser, width, pictures / f"{name.replace('/', '_')}_{device}.png")
+                report.missing_pictures += [f"{name}: {one}" for one in seen["pictures"]]
+                report.console_errors += [f"{name}: {one}" for one in browser.errors()]
                 links[name], places[page] = seen["links"], set(seen["places"])
             if pages:
-                browser.open((site / "index.html").as_uri(), WIDTHS["laptop"], 900)
+                browser.resize(WIDTHS["laptop"], _HEIGHT)
+                browser.open((site / "index.html").as_uri())
                 report.search_results = browser.evaluate(_SEARCH.replace("WORD", json.dumps(word)).replace("PATIENCE", str(1000 * patience)))
         finally:
             browser.close()

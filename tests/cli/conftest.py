@@ -1,5 +1,8 @@
 """What the tests of several commands look at."""
 
+import shutil
+from pathlib import Path
+
 import pytest
 from commands import TINY
 
@@ -14,8 +17,14 @@ def run(tmp_path_factory):
     return path
 
 
-@pytest.fixture
-def demos_file(tmp_path):
-    path = tmp_path / "demos.hdf5"
+@pytest.fixture(scope="session")
+def recorded_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("recorded") / "demos.hdf5"
     cli.main(["demos", "record", "--env", "FixedGridPickAndPlace", "--demos", "2", "--out", str(path)])
     return path
+
+
+@pytest.fixture
+def demos_file(recorded_file, tmp_path):
+    """A copy, to be changed."""
+    return Path(shutil.copy(recorded_file, tmp_path / "demos.hdf5"))

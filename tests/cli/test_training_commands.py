@@ -118,13 +118,26 @@ def test_never_is_explained_where_sampled_actions_solved_the_task():
     assert said_of_never(seeds[2:3], [evaluation(2, 0, 0.9, None)]) == []  # of bc, which plays no sampled actions
 
 
-def test_config_runs_again_and_other_flags_change_it(run, tmp_path):
-    again = tmp_path / "again"
-    cli.main(["train", "--config", str(run), "--out", str(again)])
+def test_config_runs_again_in_place_of_another_run_whose_checkpoints_are_not_read(run, tmp_path, monkeypatch):
+    again = shutil.copytree(run, tmp_path / "again")
+    left = again / "checkpoint" / "240"
+    left.mkdir(parents=True)
+    for name in ("config.json", "parameters.npz"):
+        (again / name).write_text("of another run")
+
+    def read(self, begun):
+        raise AssertionError("a checkpoint of another run is read")
+
+    monkeypatch.setattr("hindrl_jax.runs.checkpoints.Checkpoints.restore", read)
+    cli.main(["train", "--config", str(run), "--overwrite", "--out", str(again)])
+    assert not left.exists()
     assert (again / "config.json").read_text() == (run / "config.json").read_text()
     with np.load(run / "parameters.npz") as first, np.load(again / "parameters.npz") as second:
         for name in first.files:
             np.testing.assert_array_equal(first[name], second[name])
+
+
+def test_other_flags_change_a_config(run):
     spec, _ = parse_train(["--config", str(run / "config.json"), "--learning-rate", "0.5", "--seeds", "1"])
     assert (spec.config.agent.learning_rate, spec.seeds, spec.config.batch.batch_size) == (0.5, (5,), 16)
 
@@ -258,21 +271,6 @@ def test_files_that_are_not_ours_are_not_replaced(tmp_path, capsys):
     (tmp_path / "summary.json").write_text("mine")
     assert "summary.json" in refusal(capsys, "train", "--out", tmp_path, *TINY)
     assert (tmp_path / "summary.json").read_text() == "mine"
-
-
-def test_a_run_that_is_overwritten_does_not_go_on_from_its_checkpoints(run, tmp_path, monkeypatch):
-    killed = tmp_path / "killed"
-    shutil.copytree(run, killed)
-    left = killed / "checkpoint" / "240"
-    left.mkdir(parents=True)
-
-    def read(self, begun):
-        raise AssertionError("a checkpoint of another run is read")
-
-    monkeypatch.setattr("hindrl_jax.runs.checkpoints.Checkpoints.restore", read)
-    cli.main(["train", "--overwrite", "--out", str(killed), *TINY])
-    assert not left.exists()
-    assert (killed / "metrics.csv").read_text().splitlines()[1].startswith("0,240,")
 
 
 def test_existing_run_is_refused_and_kept(run, capsys):

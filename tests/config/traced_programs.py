@@ -1,5 +1,6 @@
 """The training program of a config as it is traced, to be compared with that of another config."""
 
+import contextlib
 import itertools
 import re
 
@@ -102,8 +103,9 @@ class Program:
         self.values = dict(sorted(swept(config).items()))
         self.whole = Traced(Stages(config).whole, self.values, self.ARGUMENTS)
         self.used_values = self.whole.used_inputs & self.values.keys()
-        self.parts, arguments = {}, self.ARGUMENTS
+        self.parts, self.given, arguments = {}, {}, self.ARGUMENTS
         for name, part in Stages(config).parts().items():
+            self.given[name] = arguments
             self.parts[name] = Traced(part, self.values, arguments)
             arguments = self.parts[name].shapes
         for part, following in reversed(list(itertools.pairwise(self.parts.values()))):
@@ -112,8 +114,15 @@ class Program:
     def is_that_of(self, config):
         return Traced(Stages(config).whole, self.values, self.ARGUMENTS).text == self.whole.text
 
-    def differs_from(self, config):
-        """The opposite, found out part by part, since most changes show early; what shows in no part is looked for in the whole."""
+    def differs_from(self, config, first=()):
+        """The opposite, found out part by part, since most changes show early; what shows in no part is looked for in the whole.
+
+        The parts named `first` come before the others, given what they are given here: where a change shows in them, it is as good as found.
+        """
+        for name in self.parts.keys() & set(first):
+            with contextlib.suppress(Exception):  # it wants other shapes
+                if Traced(getattr(Stages(config), name), self.values, self.given[name], self.parts[name].used_outputs).text != self.parts[name].text:
+                    return True
         arguments = self.ARGUMENTS
         for name, part in Stages(config).parts().items():
             own = self.parts.get(name)

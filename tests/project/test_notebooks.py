@@ -13,19 +13,23 @@ _SPEC = importlib.util.spec_from_file_location("execute_notebooks", FOLDER.paren
 execute_notebooks = importlib.util.module_from_spec(_SPEC)
 _SPEC.loader.exec_module(execute_notebooks)
 MOST_BYTES = 1_500_000  # of all notebooks together: each version of one is kept by git for ever
+# Presets are small, too, from the cell of sizes on.
+SIZES = "# The size"
+SMALL_PRESETS = f"\nimport sys; sys.path.append({str(FOLDER.parent / 'tests')!r})\nimport small_presets; small_presets.install()"
 # What each is made smaller by, and how many pictures and films it shows.
 NOTEBOOKS = {
-    "01_quickstart": ({"STEPS = None": "STEPS = 4_000"}, 2, 1),
-    "02_your_own_task": ({"STEPS = 40_000": "STEPS = 2_000", "SEEDS = [0, 1]": "SEEDS = [0]"}, 3, 0),
-    "03_your_own_demonstrations": ({"STEPS = None": "STEPS = 2_000", "SEEDS = [0, 1]": "SEEDS = [0]"}, 2, 1),
+    "01_quickstart": ({"STEPS = None": "STEPS = 260"}, 2, 1),
+    "02_your_own_task": ({"STEPS = 40_000": "STEPS = 260", "SEEDS = [0, 1]": "SEEDS = [0]"}, 3, 0),
+    "03_your_own_demonstrations": ({"STEPS = None": "STEPS = 260", "SEEDS = [0, 1]": "SEEDS = [0]"}, 2, 1),
     "04_goals_and_epsilon": ({"DEMOS = 5": "DEMOS = 2"}, 4, 0),
-    "05_many_seeds_and_settings": ({"STEPS = 48_000": "STEPS = 2_000", "SEEDS = [0, 1, 2, 3]": "SEEDS = [0, 1]"}, 1, 0),
+    "05_many_seeds_and_settings": ({"STEPS = 48_000": "STEPS = 260", "SEEDS = [0, 1, 2, 3]": "SEEDS = [0, 1]"}, 1, 0),
     "06_two_arms": ({"STEPS = 80_000": "STEPS = 6_000", "DEMOS = 20": "DEMOS = 2", "EPISODES = 100": "EPISODES = 10"}, 4, 1),
     "07_thesis": ({"../benchmarks": "benchmarks"}, 2, 0),  # from where the tests run; the report there is small
 }
 
 
-_ALL = [pytest.param(name, marks=pytest.mark.slow) if name == "06_two_arms" else name for name in NOTEBOOKS]  # minutes of compilation
+SLOW = "06_two_arms"  # minutes of compilation
+_ALL = [pytest.param(name, marks=pytest.mark.slow) if name == SLOW else name for name in NOTEBOOKS]
 
 
 @pytest.mark.parametrize("name", _ALL)
@@ -37,6 +41,9 @@ def test_notebook_runs(name):
     for large, small in smaller.items():
         (cell,) = [cell for cell in notebook.cells if cell.cell_type == "code" and large in cell.source]
         cell.source = cell.source.replace(large, small)
+    for cell in notebook.cells:
+        if cell.cell_type == "code" and cell.source.startswith(SIZES) and name != SLOW:
+            cell.source += SMALL_PRESETS
     NotebookClient(notebook, timeout=300, kernel_name="python3", coalesce_streams=True).execute()
     outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
     assert not any(output.output_type == "error" for output in outputs)

@@ -8,7 +8,7 @@ import jax
 import pytest
 
 from hindrl_jax.base.errors import UserError
-from hindrl_jax.config import TrainConfig
+from hindrl_jax.config import TrainConfig, without_effect
 from hindrl_jax.core import train as training
 from hindrl_jax.core.guidance import guidance
 from hindrl_jax.reproduction.cells import changed
@@ -37,11 +37,34 @@ def demonstration():
     return env, record_demonstrations(env, 1)
 
 
-@pytest.mark.parametrize("option", OPTIONS, ids=lambda option: option.name)
-def test_every_option_makes_a_program(option, demonstration):
+def go_together(options):
+    """Whether options change different fields, the config takes all their changes, and each has its effect beside the others."""
+    changes = [change for option in options for change in option.changes]
+    names = [name for name, _ in changes]
+    try:
+        config = changed(RECIPE, changes)
+    except UserError:
+        return False
+    return len(set(names)) == len(names) and all(without_effect(config, name.rpartition(".")[2]) is None for name in names)
+
+
+def together():
+    """All options, as many at once as go together: tracing one program takes a second."""
+    packs = []
+    for option in reversed(OPTIONS):  # the other algorithm last, since most have their effect with either
+        pack = next((pack for pack in packs if go_together([*pack, option])), None)
+        if pack is None:
+            packs.append([option])
+        else:
+            pack.append(option)
+    return packs
+
+
+@pytest.mark.parametrize("options", together(), ids=lambda options: options[0].name)
+def test_every_option_makes_a_program(options, demonstration):
     """Traced, not compiled: what the config's own checks let pass, the training must not refuse."""
     env, episodes = demonstration
-    config = changed(RECIPE, option.changes)
+    config = changed(RECIPE, [change for option in options for change in option.changes])
 
     def start_and_learn(key):
         data = guidance(episodes, env, config)

@@ -17,13 +17,15 @@ from hindrl_jax.reproduction.scales import Scale
 from hindrl_jax.training.experiment import Diverged
 
 SMALL = Task("FixedGridPickAndPlace", (("num_objects", 1), ("size", 4), ("random_box_size", 1), ("horizon", 20)), 1)
-NETWORK = (("agent.net_arch", (4,)), ("eval_every", 20), ("eval_episodes", 4))
+NETWORK = (("agent.net_arch", (4,)), ("eval_every", 20), ("eval_episodes", 100))
 RUN = (("steps", 80), ("num_envs", 2), ("updates_per_iteration", 1), ("learning_starts", 40), ("buffer_size", 200), ("batch.batch_size", 8))
+# As in test_ablation.py, so that programs are shared.
+SHARED = (("agent.num_quantiles", 3), ("agent.top_quantiles_to_drop_per_net", 1), ("batch.n_step", 2))
 TINY = Scale(
     "Everything.",
     seeds={"default": 2, "thesis": 2, "original": 2},
     cloning=(("steps", 40), ("batch.batch_size", 8), *NETWORK),
-    ours=(*RUN, *NETWORK),
+    ours=(*RUN, *NETWORK, *SHARED),
     theirs=(*RUN, *NETWORK, ("batch.reach_zero", None)),
 )
 

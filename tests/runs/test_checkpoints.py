@@ -21,8 +21,9 @@ from hindrl_jax.runs.spec import RunSpec
 from hindrl_jax.runs.writer import RunWriter
 from hindrl_jax.training import devices, experiment
 
-CONFIG = dataclasses.replace(tiny.CONFIG, steps=84)
-CLONING = dataclasses.replace(CONFIG, algo="bc", steps=60)
+# Evaluated after every second chunk, with the programs of `tiny`.
+CONFIG = dataclasses.replace(tiny.CONFIG, eval_every=4)
+CLONING = dataclasses.replace(CONFIG, algo="bc", steps=20)
 SEEDS = (3, 4)
 
 pytestmark = [
@@ -101,17 +102,25 @@ def assert_same(result, expected):
     assert [dataclasses.replace(row, seconds=0.0) for row in result.rows] == [dataclasses.replace(row, seconds=0.0) for row in expected.rows]
 
 
-@pytest.mark.parametrize("config", [CONFIG, CLONING], ids=["hindrl", "bc"])
-def test_a_run_killed_again_and_again_ends_as_if_it_never_was(tmp_path, demonstrations, config):
-    # Reports: 1 is before anything happened, then one for each chunk of 2 steps, so there are evaluations between and right before the kills.
-    for at in (4, 12):
-        with pytest.raises(Killed):
-            fit(demonstrations, config, checkpoints=Checkpoints(tmp_path, seconds=0), kill_at=at)
-    checkpoints = Checkpoints(tmp_path, seconds=0)
+def assert_ends_as_if_never_killed(folder, demonstrations, config, kill_at):
+    """After one more kill, which is at this report."""
+    with pytest.raises(Killed):
+        fit(demonstrations, config, checkpoints=Checkpoints(folder, seconds=0), kill_at=kill_at)
+    checkpoints = Checkpoints(folder, seconds=0)
     resumed = fit(demonstrations, config, checkpoints=checkpoints)
     assert_same(resumed, fit(demonstrations, config))
-    assert [path.name for path in tmp_path.iterdir()] == [str(checkpoints.steps)]  # only the newest is kept
+    assert [path.name for path in folder.iterdir()] == [str(checkpoints.steps)]  # only the newest is kept
     assert 0 < resumed.rows[0].seconds < resumed.rows[-1].seconds <= resumed.train_seconds
+
+
+def test_a_run_killed_again_and_again_ends_as_if_it_never_was(stopped, demonstrations):
+    # Report 1 is of where a run begins or goes on, here at step 44 with an evaluation, then there is one for each chunk of 2 steps: there are
+    # evaluations between the kills, and one right before the second.
+    assert_ends_as_if_never_killed(stopped, demonstrations, CONFIG, kill_at=6)
+
+
+def test_cloning_that_was_killed_ends_as_if_it_never_was(tmp_path, demonstrations):
+    assert_ends_as_if_never_killed(tmp_path, demonstrations, CLONING, kill_at=10)  # of 20 updates, an evaluation after every fourth
 
 
 def test_half_a_checkpoint_is_never_read(stopped, begun):

@@ -10,7 +10,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from commands import TINY
 
+from hindrl_jax import cli
 from hindrl_jax.training import devices
 
 TRAIN = """
@@ -54,35 +56,33 @@ def test_eight_devices_give_what_one_gives():
     np.testing.assert_allclose(eight["checksum"], one["checksum"], rtol=1e-3)
 
 
-def hindrl(*arguments, devices=1):
+def hindrl(*arguments):
     command = [sys.executable, "-m", "hindrl_jax", *map(str, arguments)]
-    return subprocess.Popen(command, env=with_devices(devices), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(command, env=with_devices(1), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def test_two_processes_give_what_one_gives(tmp_path):
-    tiny = (
-        "--seeds 2 --num-envs 2 --learning-starts 200 --steps 240 --eval-every 40 --eval-episodes 3 --batch-size 16 --net-arch 8 --buffer-size 2000"
-    )
+    """The one is this process: its programs are those of other tests, while the two begin without any."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     together = ["--distributed", "--coordinator", f"127.0.0.1:{port}", "--num-hosts", 2]
     runs = [
-        hindrl("train", "--out", tmp_path / "two", *tiny.split(), *together, "--host", 0),
-        hindrl("train", "--out", tmp_path / "two", *tiny.split(), *together, "--host", 1),
-        hindrl("train", "--out", tmp_path / "one", *tiny.split()),
+        hindrl("train", "--out", tmp_path / "two", "--seeds", 2, *TINY, *together, "--host", 0),
+        hindrl("train", "--out", tmp_path / "two", "--seeds", 2, *TINY, *together, "--host", 1),
     ]
     try:
+        cli.main(["train", "--out", str(tmp_path / "one"), "--seeds", "2", *TINY])
         outputs = [run.communicate(timeout=300) for run in runs]
     finally:
         for run in runs:
             run.kill()
-    assert [run.returncode for run in runs] == [0, 0, 0], outputs
+    assert [run.returncode for run in runs] == [0, 0], outputs
     assert "on 2 of 2 devices" in outputs[0][0]
     assert "FixedGrid" in outputs[0][0]
     assert "FixedGrid" not in outputs[1][0]  # only the first host prints and writes
     one, two = (list(csv.DictReader((tmp_path / name / "metrics.csv").read_text().splitlines())) for name in ("one", "two"))
-    assert [(row["seed"], row["env_steps"]) for row in two] == [("0", "240"), ("1", "240")]
+    assert [(row["seed"], row["env_steps"]) for row in two] == [("0", "240"), ("1", "240"), ("0", "260"), ("1", "260")]
     for expected, given in zip(one, two, strict=True):
         for name in expected.keys() - {"seconds"}:
             assert float(given[name]) == pytest.approx(float(expected[name]), rel=1e-3, abs=1e-5), name

@@ -246,12 +246,11 @@ def test_a_run_goes_on_where_it_was_stopped_with_the_policies_that_were_kept(sol
 
 def test_a_report_that_returns_true_ends_the_run_which_can_be_saved(tmp_path):
     demonstrations = hindrl.record_demonstrations(tiny.ENV, 2)
-    config = dataclasses.replace(tiny.CONFIG, steps=400, eval_every=100)
-    first, second = [], []
+    first, second, config = [], [], tiny.CONFIG
     result = hindrl.fit(tiny.ENV, demonstrations, config, report=lambda result: bool(first.append(result.env_steps)) or len(first) == 3)
     # Reports: before anything happened, after two chunks, and at the end.
     assert len(first) == 4
-    assert result.env_steps == first[2] < 100
+    assert result.env_steps == first[2] < 60
     assert len(result.rows) == 1  # it was not evaluated before
     assert result.returned is not None
     (saved,) = hindrl.save_run(tmp_path, result)["seeds"]
@@ -261,5 +260,5 @@ def test_a_report_that_returns_true_ends_the_run_which_can_be_saved(tmp_path):
     for policy, actor in ((run.policies, result.returned.actor), (last.policies, result.state.agent.average_actor)):
         jax.tree.map(np.testing.assert_array_equal, policy.actor, actor)
     # What is merely not empty, such as what several reporters return together, ends nothing.
-    hindrl.fit(tiny.ENV, demonstrations, dataclasses.replace(config, steps=120), report=lambda result: (second.append(result.env_steps), None))
-    assert second[-1] == 120
+    hindrl.fit(tiny.ENV, demonstrations, config, report=lambda result: (second.append(result.env_steps), None))
+    assert second[-1] == 60
