@@ -114,7 +114,7 @@ def _goals(env: Environment) -> GoalConfig:
     if _gives_goals(env):
         tolerance = getattr(env, "goal_tolerance", None)
         return GoalConfig(behavioural_goals="environment", epsilon=None if tolerance is None else _rounded_down(np.min(tolerance)))
-    one_goal = isinstance(env, RelabelsObservations) or env.task_goal() is None
+    one_goal = isinstance(env, RelabelsObservations) or isinstance(env, GymnasiumEnv)
     return GoalConfig(behavioural_goals="task" if one_goal else "final_demonstration_states")
 
 

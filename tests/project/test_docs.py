@@ -95,7 +95,7 @@ def test_flags_exist(site):
     others = {"--ntasks-per-node", "--gpus-per-node"}  # SLURM's
     others |= {"--gate-width", "--noise"}  # the example's own
     others |= {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(GymnasiumEnv)}  # which has a page only where it is installed
-    others |= {"--only", "--help", "--help-all", "--version", "--logdir"}
+    others |= {"--only", "--minutes", "--help", "--help-all", "--version", "--logdir"}
     for path in (README, *PAGES):
         unknown = set(re.findall(r"(?<![\w-])--[a-z][a-z0-9-]*", path.read_text())) - known - others
         assert not unknown, f"{path.name}: {unknown}"
