@@ -25,13 +25,13 @@ CONFIG = TrainConfig(
 
 class PointGoal(gymnasium.Env):
     """Actions in [-2, 2] move the point by a quarter of that. `says` is what says that the goal is reached: an entry of the info, or the reward;
-    `ends` whether an episode ends there, or None, where it does not and nothing says so."""
+    `ends` whether an episode ends there, or None, where it does not and nothing says so; `moves` has the goal jump at each step."""
 
     metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 10}
     distance_threshold = 0.2
 
-    def __init__(self, says: str = "is_success", ends: bool | None = None, render_mode: str | None = None):
-        self.says, self.ends, self.render_mode = says, bool(ends), render_mode
+    def __init__(self, says: str = "is_success", ends: bool | None = None, moves: bool = False, render_mode: str | None = None):
+        self.says, self.ends, self.moves, self.render_mode = says, bool(ends), moves, render_mode
         if ends is not None:
             self.compute_terminated = lambda achieved_goal, desired_goal, info: ends and self.compute_reward(achieved_goal, desired_goal, info) == 0.0
         place = Box(-1.0, 1.0, (2,))
@@ -45,6 +45,8 @@ class PointGoal(gymnasium.Env):
 
     def step(self, action):
         self.place = np.clip(self.place + SPEED * np.asarray(action) / 2.0, -1.0, 1.0)
+        if self.moves:
+            self.goal = -self.goal
         reward = float(self.compute_reward(self.place, self.goal, {}))
         return self._observation(), reward, self.ends and reward == 0.0, False, {} if self.says == "reward" else {self.says: reward == 0.0}
 

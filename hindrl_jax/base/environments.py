@@ -51,7 +51,7 @@ class Environment(Protocol):
         """The projection Phi of thesis section 2.2: observations (..., D) -> achieved goals (..., G)."""
 
     def task_goal(self) -> Array | None:
-        """(G,) one fixed goal that stands for "the task is solved"; None where the environment knows of none."""
+        """(G,) one fixed goal that stands for "the task is solved"; None, which only one that is stepped outside JAX may say, if it knows none."""
 
 
 @runtime_checkable
@@ -81,7 +81,10 @@ def backends_with(env: Any, ability: Callable[[Any], bool]) -> list[str]:
 
 
 def holds_goal(env: Environment) -> bool:
-    """Whether episodes go on where the goal is reached, to their horizon, and are solved where it is still reached at their last step."""
+    """Whether episodes go on where the goal is reached, to their horizon, and are solved where it is still reached at their last step.
+
+    Environments that are stepped outside JAX and give goals say so by an attribute `success`, "held" or "reached"; all others end at their goals.
+    """
     return getattr(env, "success", None) == "held"
 
 

@@ -21,7 +21,7 @@ class Outcome:
 
     next_observation: np.ndarray  # (E, D) float32, the true next one
     success: np.ndarray  # (E,) bool, the task was solved by this step
-    terminated: np.ndarray  # (E,) bool, the episode is over, be it by success or by the environment's own rules
+    terminated: np.ndarray  # (E,) bool, the episode is over by the environment's own rules, or by success, unless the goal is to be held
     truncated: np.ndarray  # (E,) bool, the horizon cut it; never both
     observation: np.ndarray  # (E, D) float32, where the environments are now: in a new episode, if the old one is over
     desired_goal: np.ndarray | None  # (E, G) float32, of the episode in which they are now; None where episodes have no goals of their own
@@ -74,7 +74,8 @@ class HostStepped(Environment, Protocol):
 
     @property
     def gives_goals(self) -> bool:
-        """Whether each of its episodes comes with a goal of its own, rather than with a behavioural goal from the demonstrations."""
+        """Whether each of its episodes comes with a goal of its own, rather than with a behavioural goal from the demonstrations. If so, an attribute
+        `success` may say that the goal is to be held (`base.environments.holds_goal`)."""
 
     def stepper(self, num_envs: int, *, num_held: int = 1) -> Stepper:
         """That many environments side by side, which hold each action for `num_held` steps, or until the episode is over."""

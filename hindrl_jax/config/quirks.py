@@ -16,8 +16,8 @@ class QuirksConfig:
     """A goal counts as reached at distance < epsilon, as in the thesis's formula and code, not <=. With epsilon 0 it never does. The filter of
     demonstrated goals keeps what is farther than epsilon all the same, as in the code."""
     bootstrap_past_relabelled_goals: bool = False
-    """Reaching a relabelled goal does not end the return, as in the thesis, so that values can exceed 1. Where hindsight relabels observations in
-    place of goals (ParameterizedReach), a solved task always ends it."""
+    """Reaching a relabelled goal does not end the return, as in the thesis, so that values can exceed 1. Where goals are to be held it never does. Where
+    hindsight relabels observations in place of goals (ParameterizedReach), a solved task always ends it."""
     timeouts_are_terminal: bool = False
     """Treat episodes that are cut by the horizon as terminated, as the original code does by mistake."""
     exclude_last_goal: bool = False
@@ -32,7 +32,8 @@ class QuirksConfig:
     bc_action: Literal["mean", "sample"] = "mean"
     """Compare the policy's mean action (thesis) or a sampled one (original code) with the demonstrated action."""
     achieved_goal_input: bool = False
-    """Networks see achieved goal, desired goal and observation, as in the thesis's framework, in place of observation and desired goal."""
+    """Networks see achieved goal, desired goal and observation, as in the thesis's framework, in place of observation and desired goal, or, where
+    episodes have goals of their own, in place of observation and what is left to the goal."""
 
     def __post_init__(self) -> None:
         check_types(self)

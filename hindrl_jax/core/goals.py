@@ -110,7 +110,7 @@ class GoalTest(struct.PyTreeNode, kw_only=True):
     epsilon: Array  # (G,) half-width of the goal box
     inclusive: bool = struct.field(pytree_node=False, default=True)  # which box test, see `goal_reached`
     ends_return: bool = struct.field(pytree_node=False, default=True)  # whether the return ends where the goal is reached
-    own_goals: bool = struct.field(pytree_node=False, default=False)  # whether episodes have goals of their own, and end where these are reached
+    own_goals: bool = struct.field(pytree_node=False, default=False)  # whether episodes have goals of their own
 
     def reached(self, observations: Array, goals: Array) -> Array:
         """Whether goals (..., G) are reached at observations (..., D): (...) bool."""

@@ -121,7 +121,7 @@ def longest_hold(lengths: Array) -> int:
     """For how many control steps actions can be held: the most with which the median demonstration takes `FEWEST_DECISIONS`, at least 1.
 
     Args:
-      lengths: of the demonstrations, in control steps, any shape.
+      lengths: of the demonstrations, in control steps, any shape; where the goal is to be held, of their ways to it.
     """
     return max(1, int(jnp.median(lengths)) // FEWEST_DECISIONS)
 
@@ -140,7 +140,7 @@ def with_action_hold(config: TrainConfig, demonstrations: Episodes) -> TrainConf
     return dataclasses.replace(config, action_hold=num_held)
 
 
-def hold_demonstrations(demonstrations: Episodes, num_held: int, *, chunks: bool = False) -> Episodes:
+def hold_demonstrations(demonstrations: Episodes, num_held: int, *, chunks: bool = False, holds_goal: bool = False) -> Episodes:
     """Demonstrations as `hold` would have shown them: every k-th state and the last one, and between them the mean of the actions, or all of them.
 
     The mean of commands to move is the command that, held, moves as far. Where the motion is finer than k steps, the demonstrated
@@ -150,6 +150,7 @@ def hold_demonstrations(demonstrations: Episodes, num_held: int, *, chunks: bool
       demonstrations: N of T control steps, numpy or JAX, leaves (..., N, ...).
       num_held: k.
       chunks: whether decisions are chunks.
+      holds_goal: whether the goal is to be held: a decision has the reward of its last control step, in place of the sum of all.
 
     Returns:
       Numpy leaves, the same but for T, which counts decisions.
@@ -173,11 +174,15 @@ def hold_demonstrations(demonstrations: Episodes, num_held: int, *, chunks: bool
         values = jnp.pad(values, [*nothing, (0, horizon * num_held - steps), (0, 0)])
         return values.reshape(*values.shape[:-2], horizon, num_held, values.shape[-1]).sum(axis=-2)
 
+    rewards = sums(demonstrations.rewards[..., None])[..., 0]
+    if holds_goal:
+        at_last_steps = jnp.take_along_axis(jnp.asarray(demonstrations.rewards), jnp.maximum(starts[..., 1:] - 1, 0), axis=-1)
+        rewards = jnp.where(jnp.diff(starts, axis=-1) > 0, at_last_steps, 0.0)
     mean_action = sums(demonstrations.actions) / jnp.maximum(jnp.diff(starts, axis=-1), 1)[..., None]
     held = demonstrations.replace(
         observations=at_decisions(demonstrations.observations),
         actions=_cut_into_chunks(jnp.asarray(demonstrations.actions), lengths, num_held) if chunks else mean_action,
-        rewards=sums(demonstrations.rewards[..., None])[..., 0],
+        rewards=rewards,
         lengths=-(-lengths // num_held),
         states=None if demonstrations.states is None else at_decisions(demonstrations.states),
     )

@@ -71,7 +71,12 @@ def _encode(values: Array, centre: Array, scale: Array, config: AgentConfig) -> 
 
 
 def seen_goal(achieved_goal: Array, desired_goal: Array, config: TrainConfig) -> Array:
-    """The goal as networks see it: what is left to it, where each episode has one of its own; else as it is. All (..., G)."""
+    """The goal as networks see it, (..., G): what is left to it, where each episode has one of its own (`TrainConfig.relative_goals`); else as it is.
+
+    Args:
+      achieved_goal, desired_goal: (..., G) in task units.
+      config: of the run.
+    """
     return desired_goal - achieved_goal if config.relative_goals else desired_goal
 
 

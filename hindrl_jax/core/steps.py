@@ -63,8 +63,15 @@ def read_steps(episodes: Episodes, rows: Array, steps: Array, n_step: int) -> St
 def as_occupancy(steps: Steps, gamma: Array | float) -> Steps:
     """Rewards for being at the goal, where episodes go on there: (1 - gamma) at each step.
 
-    So returns stay in [0, 1]: who reaches the goal after t steps, and stays, has gamma^t, as where the episode ends at the goal with a reward of 1.
-    An episode that the environment itself ends at the goal counts as one that stays there.
+    So returns stay in [0, 1]: who is at the goal after step t, counted from 1, and stays there, has gamma^(t - 1), as where the episode ends at the
+    goal with a reward of 1. An episode that the environment itself ends at the goal counts as one that stays there.
+
+    Args:
+      steps: B rows of n steps, rewards 1 at each step at the goal, else 0.
+      gamma: discount factor.
+
+    Returns:
+      The same, rewards (B, n) scaled.
     """
     stays = steps.is_last & steps.terminated[:, None]
     return steps.replace(rewards=jnp.where(stays, 1.0, 1.0 - gamma) * steps.rewards)

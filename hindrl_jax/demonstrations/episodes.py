@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from hindrl_jax.base.environments import Environment, holds_goal, state_dim
+from hindrl_jax.base.environments import Environment, state_dim
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Episodes
 from hindrl_jax.demonstrations.recording import RECORD_AGAIN, Demonstration, Recording, plain
@@ -26,32 +26,15 @@ def as_episodes(recording: Recording, env: Environment, *, where: str | os.PathL
     check_number(where, num_demos)
     check_lengths(where, [len(demo) for demo in recording.demonstrations], env.horizon, num_demos)
     demos = [demo for demo in recording.demonstrations if len(demo) <= env.horizon][:num_demos]
-    recording = as_judged_by(env, dataclasses.replace(recording, demonstrations=tuple(demos)))
+    recording = with_goals_chosen(dataclasses.replace(recording, demonstrations=tuple(demos)), env)
     check_against_env(where, recording, env)
     return as_table(recording.demonstrations, env.horizon)
 
 
-def as_judged_by(env: Environment, recording: Recording) -> Recording:
-    """The recording with the goals and the ends that `env` gives it, where these are only chosen, so that a file serves other choices, too."""
-    if recording.env_kwargs.get("success") == "held" and not holds_goal(env):
-        recording = dataclasses.replace(recording, demonstrations=tuple(map(_up_to_the_goal, recording.demonstrations)))
-    return _with_goals_chosen(recording, env)
-
-
-def _up_to_the_goal(demo: Demonstration) -> Demonstration:
-    """A demonstration that stayed at its goal, up to where it first reached it."""
-    if not (demo.terminated and demo.rewards.any()):
-        return demo
-    end = int(np.argmax(demo.rewards > 0.0)) + 1
-    states = None if demo.states is None else demo.states[: end + 1]
-    observed = dict(observations=demo.observations[: end + 1], achieved_goals=demo.achieved_goals[: end + 1], states=states)
-    return dataclasses.replace(demo, actions=demo.actions[:end], rewards=demo.rewards[:end], extras={}, **observed)
-
-
-def _with_goals_chosen(recording: Recording, env: Environment) -> Recording:
+def with_goals_chosen(recording: Recording, env: Environment) -> Recording:
     """The recording with the goals that `env` derives, where what a goal is is only chosen: flat observations of Gymnasium, `achieved_goal_indices`.
 
-    The desired goals are then the ends of the demonstrations.
+    So a file serves other choices than the one with which it was recorded. The desired goals are then the ends of the demonstrations.
     """
     chosen = getattr(env, "achieved_goal_indices", None)
     fits = all(demo.observations.shape[1] == env.observation_dim for demo in recording.demonstrations)

@@ -41,7 +41,7 @@ from hindrl_jax.base.types import Episodes
 from hindrl_jax.demonstrations._hdf5_files import hdf5_bytes, opened
 from hindrl_jax.demonstrations._layout import write_layout
 from hindrl_jax.demonstrations._reading import read_all, read_demonstrations, read_header, with_extras
-from hindrl_jax.demonstrations.episodes import as_judged_by, as_recording, as_table, check_against_env, check_lengths, check_number
+from hindrl_jax.demonstrations.episodes import as_recording, as_table, check_against_env, check_lengths, check_number, with_goals_chosen
 from hindrl_jax.demonstrations.recording import DemonstrationSummary, Recording, summarise_recording
 
 
@@ -124,7 +124,7 @@ def load_demonstrations(path: str | os.PathLike[str], env: Environment, *, num_d
         fitting = [(name, length) for name, length in lengths.items() if length <= env.horizon]
         recording = read_demonstrations(path, file, header, dict(fitting[:num_demos]))
     check_lengths(path, list(lengths.values()), env.horizon, num_demos)
-    recording = as_judged_by(env, recording)
+    recording = with_goals_chosen(recording, env)
     check_against_env(path, recording, env)
     return as_table(recording.demonstrations, env.horizon)
 

@@ -82,7 +82,7 @@ class TrainedValue:
 
     @in_float32
     def __call__(self, observation: Any, goal: Any = None, action: Any = None) -> Array:
-        """The mean over critics (and quantiles) of the return: gamma^n where the goal is reached n decisions later, if it surely is.
+        """The mean over critics (and quantiles) of the return: gamma^(n - 1) where the goal is reached by the n-th decision.
 
         Args:
           observation: (..., D) in the task's units.

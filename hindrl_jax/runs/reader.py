@@ -184,7 +184,7 @@ class Run:
     def play(self, episodes: int = 1, *, seed: int | None = None, key: jax.Array | None = None, noise: float | None = None) -> Episodes:
         """Plays fresh episodes with one seed's policy (the first seed's by default), to be looked at step by step; solved or not.
 
-        Each episode aims at a behavioural goal that is drawn for it, as in `evaluate`: the end of a demonstration, say.
+        Each episode aims at a behavioural goal that is drawn for it, as in `evaluate`: the end of a demonstration, say, or the episode's own.
 
         Args:
           episodes: N, how many.

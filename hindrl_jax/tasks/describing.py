@@ -40,8 +40,8 @@ class Description:
     horizon: int | None
     goal_tolerance: float | None
     success: SuccessRule
-    goes_on_at_goal: bool
-    """Whether it has goals, and says that reaching one does not end an episode."""
+    ends_at_goal: bool | None
+    """Whether reaching a goal ends an episode; None where it has no goals or does not say it."""
     render_fps: int
 
 
@@ -129,7 +129,7 @@ def _described(gymnasium_id: str, env: Any) -> Description:
         horizon=env.spec.max_episode_steps,
         goal_tolerance=float(threshold) / goal_dim**0.5 if is_number and gives_goals else None,
         success=success,
-        goes_on_at_goal=gives_goals and _goes_on(env, np.asarray(begun[0]["desired_goal"]), taken[4]),
+        ends_at_goal=_ends_at_goal(env, np.asarray(begun[0]["desired_goal"]), taken[4]) if gives_goals else None,
         render_fps=env.metadata.get("render_fps", 25),
     )
 
@@ -175,10 +175,10 @@ def _reward_at_goal(gymnasium_id: str, env: Any, goal: np.ndarray, info: dict[st
     return reward
 
 
-def _goes_on(env: Any, goal: np.ndarray, info: dict[str, Any]) -> bool:
-    """Whether an episode goes on where its goal (G,) is reached, as the interface of Gymnasium-Robotics says it; False where nothing says it."""
+def _ends_at_goal(env: Any, goal: np.ndarray, info: dict[str, Any]) -> bool | None:
+    """Whether an episode ends where its goal (G,) is reached, as the interface of Gymnasium-Robotics says it; None where nothing says it."""
     compute_terminated = getattr(env.unwrapped, "compute_terminated", None)
-    return compute_terminated is not None and not compute_terminated(goal, goal, info)
+    return None if compute_terminated is None else bool(compute_terminated(goal, goal, info))
 
 
 def _check_observation(gymnasium_id: str, parts: dict[str, Box], observation: Any) -> None:

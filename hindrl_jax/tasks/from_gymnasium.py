@@ -5,8 +5,8 @@ States cannot be written down: episodes begin where the environment lets them be
 
 **With goals.** Observations are dictionaries of vectors `observation`, `achieved_goal` and `desired_goal`.
 
-  * Here the observation is [observation, achieved_goal], and the goal of an episode is the desired goal of its first observation. Networks see the
-    goal beside the observation, so that it can be another in hindsight.
+  * Here the observation is [observation, achieved_goal], and the goal of an episode is the desired goal of its first observation. Networks see what
+    is left to the goal beside the observation, desired less achieved, so that the goal can be another in hindsight.
   * The reward is 1 where the environment says that the goal is reached (info["is_success"] or info["success"], else a reward as high as that of
     reaching the goal exactly), else 0, whatever the environment's own is.
   * With `success` = "held" an episode goes on to its horizon, and is a success where the goal is reached at its last step, which is what papers on
@@ -85,11 +85,13 @@ class GymnasiumEnv:
                 raise UserError(f"{self.name} sets no limit to the length of an episode: give a horizon")
             object.__setattr__(self, "horizon", self.description.horizon)
         if self.success is None:
-            object.__setattr__(self, "success", "held" if self.description.goes_on_at_goal else "reached")
+            object.__setattr__(self, "success", "held" if self.description.ends_at_goal is False else "reached")
         if self.achieved_goal_indices or self.success_reward is not None:
             self._check_flat()
         if self.success == "held" and not self.gives_goals:
             raise UserError(f"success = held is for environments that give goals, which {self.name} does not: leave it out")
+        if self.success == "held" and self.description.ends_at_goal:
+            raise UserError(f"success = held is for environments that go on at a goal, and {self.name} ends episodes there: leave it out")
 
     def _check_flat(self) -> None:
         """Makes sure that the options of flat observations can be had."""

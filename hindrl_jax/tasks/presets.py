@@ -13,7 +13,7 @@ they are and from the demonstrations:
     input scales, epsilon  from the demonstrations (`core.inputs.input_scale`, thesis eq. 4.7); epsilon is the tolerance of the environment where
                            episodes come with its goals and it tells one
     behavioural goals      those that episodes come with; else the task's one goal where hindsight relabels observations, and the mean of the
-                           demonstrations' ends where the environment knows nothing of goals; else the ends of demonstrations (thesis algorithm 5)
+                           demonstrations' ends in flat environments of Gymnasium; else the ends of demonstrations (thesis algorithm 5)
     relabelling            where episodes have goals of their own, four fifths of the replay rows, as in HER (Andrychowicz et al., 2017), and where
                            they have parameters of the task in their observations half of them, with goals of demonstrations and rollouts; where
                            all aim at the same, a fifth, with goals of demonstrations: there, other goals are not what is to be learnt, and take
@@ -114,8 +114,7 @@ def _goals(env: Environment) -> GoalConfig:
     if _gives_goals(env):
         tolerance = getattr(env, "goal_tolerance", None)
         return GoalConfig(behavioural_goals="environment", epsilon=None if tolerance is None else _rounded_down(np.min(tolerance)))
-    one_goal = isinstance(env, RelabelsObservations) or isinstance(env, GymnasiumEnv)
-    return GoalConfig(behavioural_goals="task" if one_goal else "final_demonstration_states")
+    return GoalConfig(behavioural_goals="task" if isinstance(env, RelabelsObservations | GymnasiumEnv) else "final_demonstration_states")
 
 
 def _rounded_down(value: float) -> float:

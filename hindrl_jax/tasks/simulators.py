@@ -77,7 +77,8 @@ class Simulators:
         with self._failure("when an episode was to begin"):
             self._observed, _ = self._envs.reset(seed=[int(seed) for seed in seeds])
         self._steps[:] = 0
-        return self.now()
+        observation, self._goals = self.now()
+        return observation, self._goals
 
     def now(self) -> tuple[np.ndarray, np.ndarray | None]:
         """Observations (N, D) and desired goals (N, G) at present, both float32; None where observations are flat and give no goals.
@@ -125,15 +126,22 @@ class Simulators:
         with self._failure(moment):
             self._observed, rewards, terminated, truncated, info = self._envs.step(played.astype(space.dtype))
             success = self.env.success_rule.solved(info, rewards, terminated)
-        next_observation, _ = self.now()
+        next_observation, goal = self.now()
         if not holds_goal(self.env):
             terminated = terminated | success
         ended = terminated | truncated
+        if goal is not None and ((goal != self._goals).any(axis=1) & ~ended).any():
+            self._has_failed = True
+            raise SimulationFailed(
+                f"{self.env.name} changed the desired goal {moment} that went on, and a goal has to stay for an episode: let it end there, or try "
+                "--success reached"
+            )
         if autoreset and ended.any():
             with self._failure(f"{moment}, when the next one was to begin"):
                 self._observed, _ = self._envs.reset(options={"reset_mask": ended})
             self._steps[ended] = 0
         observation, desired_goal = self.now()
+        self._goals = desired_goal
         return Outcome(
             next_observation=next_observation,
             success=success,

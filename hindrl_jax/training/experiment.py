@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from hindrl_jax.base.compilation import in_float32, keep_compiled_programs
-from hindrl_jax.base.environments import Environment, can_step
+from hindrl_jax.base.environments import Environment, can_step, holds_goal
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Episodes
 from hindrl_jax.config import TrainConfig
@@ -21,6 +21,7 @@ from hindrl_jax.core.rollout import Evaluation
 from hindrl_jax.training.checks import check_config, check_memory, check_seeds, check_trainable, configs_per_seed, demonstrations_per_seed
 from hindrl_jax.training.devices import gather, spread
 from hindrl_jax.training.host import HostPrograms
+from hindrl_jax.training.judging import as_judged_by, steps_to_goal
 from hindrl_jax.training.programs import FRESH_EPISODES, JaxPrograms, Programs
 from hindrl_jax.training.progress import ProgressBar
 from hindrl_jax.training.result import SAMPLED_SUCCESS, Result, Row
@@ -80,8 +81,9 @@ def fit(
     keep_compiled_programs()
     check_trainable(env)
     check_seeds(seeds)
-    tables = demonstrations_per_seed(demonstrations, seeds, env)
-    configs = tuple(with_action_hold(config, tables) for config in configs_per_seed(config, seeds))
+    tables = as_judged_by(env, demonstrations_per_seed(demonstrations, seeds, env))
+    until_goal = tables.replace(lengths=steps_to_goal(tables)) if holds_goal(env) else tables
+    configs = tuple(with_action_hold(config, until_goal) for config in configs_per_seed(config, seeds))
     config = configs[0]
     check_config(env, config)
     check_memory(env, config, len(seeds), tables.lengths.shape[1])
@@ -89,7 +91,7 @@ def fit(
         tables = tables.replace(states=None)  # nobody needs them on the devices
 
     num_held = config.num_held
-    tables = hold_demonstrations(tables, num_held, chunks=config.action_chunks)
+    tables = hold_demonstrations(tables, num_held, chunks=config.action_chunks, holds_goal=holds_goal(env))
     if config.quirks.misaligned_demo_actions and int(tables.lengths.min()) < 2:
         raise UserError("misaligned_demo_actions needs demonstrations of at least 2 steps: turn it off or record others")
     if hasattr(report, "wait"):

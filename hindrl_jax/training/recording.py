@@ -100,7 +100,9 @@ def record(key: Array, env: Environment, expert: Expert, num_demos: int, *, max_
 
 @in_float32
 def record_gymnasium(env: Watchable, policy: Demonstrator, num_demos: int, *, seed: int = 0, max_attempts: int | None = None) -> Episodes:
-    """Records demonstrations that reach their goals, each cut where it does; others are discarded.
+    """Records demonstrations that solve the task; others are discarded. `terminated` says of all that they are solved.
+
+    Each ends where its episode does: at the goal, or where the goal is to be held, at the horizon.
 
     Args:
       env: for example from `hindrl_jax.make("gymnasium:...")`.

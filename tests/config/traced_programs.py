@@ -120,7 +120,7 @@ class Program:
         The parts named `first` come before the others, given what they are given here: where a change shows in them, it is as good as found.
         """
         for name in self.parts.keys() & set(first):
-            with contextlib.suppress(Exception):  # it wants other shapes
+            with contextlib.suppress(TypeError, ValueError):  # it wants other shapes
                 if Traced(getattr(Stages(config), name), self.values, self.given[name], self.parts[name].used_outputs).text != self.parts[name].text:
                     return True
         arguments = self.ARGUMENTS

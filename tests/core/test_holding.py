@@ -200,6 +200,14 @@ def test_demonstrations_are_held_as_worked_by_hand():
         assert leaf.dtype == before.dtype
 
 
+def test_where_the_goal_is_to_be_held_a_decision_has_the_reward_of_its_last_step():
+    rewards = np.array([[0, 1, 1, 1, 1, 99]], np.float32)  # decisions of steps 0 and 1, 2 and 3, and 4 alone
+    assert hold_demonstrations(table(rewards=rewards), 2, holds_goal=True).rewards.tolist() == [[1.0, 1.0, 1.0]]
+    rewards = np.array([[1, 0, 0, 1, 99, 99]], np.float32)
+    held = hold_demonstrations(table(rewards=rewards, lengths=np.array([4], np.int32)), 2, holds_goal=True)
+    assert held.rewards.tolist() == [[0.0, 1.0, 0.0]]
+
+
 def test_demonstrations_are_cut_into_chunks_as_worked_by_hand():
     chunks, held = hold_demonstrations(table(), 2, chunks=True), hold_demonstrations(table(), 2)
     # The third decision is a step alone, whose action 0.4 is repeated; nothing is blurred, and the padding is not read.

@@ -100,6 +100,14 @@ def test_whole_numbers_are_given_where_a_task_takes_such():
     np.testing.assert_array_equal(run.numpy_policy()(observation, goal), action)
 
 
+def test_a_run_whose_networks_saw_goals_otherwise_is_refused():
+    written = untrained(hindrl.make(POINT)).spec.to_json()
+    assert RunSpec.from_json(written, "config.json").env == hindrl.make(POINT)
+    del written["env_args"]["success"]
+    with pytest.raises(hindrl.UserError, match=r"networks saw goals otherwise .* so its policies would be misread: train again"):
+        RunSpec.from_json(written, "config.json")
+
+
 def test_policies_may_be_called_within_compiled_programs():
     policy = untrained().policy()
     observation, goal = draws(ENV, 4)

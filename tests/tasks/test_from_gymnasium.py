@@ -62,6 +62,7 @@ def test_arguments_go_to_gymnasium_and_survive_the_way_through_a_file():
         (POINT, {"make_kwargs": ("says",)}, "NAME=VALUE"),
         (POINT, {"vectorization": "threads"}, "vectorization"),
         (POINT, {"success": "kept"}, "success"),
+        (POINT, {"success": "held", "ends": True}, "ends episodes there: leave it out"),
         ("gymnasium:Pendulum-v1", {"success": "held"}, "is for environments that give goals"),
         (POINT, {"horizon": 0}, "at least 1"),
     ],

@@ -15,11 +15,13 @@ from toy_env import corridor_demonstrations
 import hindrl_jax as hindrl
 from hindrl_jax import cli
 from hindrl_jax.base.errors import UserError
+from hindrl_jax.base.steppers import SimulationFailed
 from hindrl_jax.core.batch import REWARDED_BY_GOAL, rows_of_demonstrations
 from hindrl_jax.core.hindsight import NEARBY_GOAL
 from hindrl_jax.runs.checkpoints import Checkpoints
 from hindrl_jax.tasks.simulators import Simulators
 from hindrl_jax.training.host_playing import play
+from hindrl_jax.training.judging import as_judged_by
 from hindrl_jax.training.recording import record_gymnasium
 
 POINT = "gymnasium:point_env:PointGoal-v0"
@@ -54,37 +56,51 @@ def test_demonstrations_are_what_the_policy_did_up_to_the_goal(env, demonstratio
     np.testing.assert_array_equal(again.observations, demonstrations.observations)
 
 
-def test_demonstrations_that_stay_at_their_goal_serve_where_the_episode_ends_there(env, demonstrations, tmp_path):
-    holds = dataclasses.replace(env, success="held")
-    recorded = record_gymnasium(holds, to_goal, 5, seed=1)
+def test_demonstrations_that_stay_at_their_goal_serve_where_the_episode_ends_there(env):
+    recorded = record_gymnasium(dataclasses.replace(env, success="held"), to_goal, 5, seed=1)
     assert recorded.lengths.tolist() == [10] * 5
     assert recorded.rewards[:, -1].all()
     assert (np.diff(recorded.rewards, axis=1) >= 0.0).all()  # none leaves its goal
-    hindrl.save_demonstrations(tmp_path / "demos.hdf5", recorded, env=holds, env_args=dataclasses.asdict(holds))
-    np.testing.assert_array_equal(hindrl.load_demonstrations(tmp_path / "demos.hdf5", holds).rewards, recorded.rewards)
-    cut = hindrl.load_demonstrations(tmp_path / "demos.hdf5", env)
-    for i, length in enumerate(cut.lengths):
-        assert length == np.argmax(recorded.rewards[i]) + 1
-        np.testing.assert_array_equal(cut.observations[i, : length + 1], recorded.observations[i, : length + 1])
-        np.testing.assert_array_equal(cut.rewards[i], np.arange(10) == length - 1)
+    cut = as_judged_by(env, recorded)
+    assert cut.lengths.tolist() == (np.argmax(recorded.rewards, axis=1) + 1).tolist()
+    np.testing.assert_array_equal(cut.rewards, np.arange(10) == cut.lengths[:, None] - 1)
+    np.testing.assert_array_equal(cut.observations, recorded.observations)
+    hindrl.fit(env, recorded, dataclasses.replace(CONFIG, steps=60, eval_every=20))  # the same in memory
 
 
-def test_where_the_goal_is_to_be_held_episodes_go_on_and_values_stay_below_one(env):
+@pytest.mark.parametrize("num_held", [1, 3])
+def test_where_the_goal_is_to_be_held_episodes_go_on(env, num_held):
     """The demonstrations end at their goals, which is not the end of an episode here."""
     holds = dataclasses.replace(env, success="held")
-    result = hindrl.fit(holds, record_gymnasium(env, to_goal, 5, seed=1), CONFIG)
-    replay = jax.device_get(result.state.replay)
-    assert set(replay.episodes.lengths[0].tolist()) <= {0, 10}
-    assert not replay.episodes.terminated.any()
-    assert replay.episodes.rewards[0, :, :-1].any()
+    config = dataclasses.replace(CONFIG, action_hold=num_held, steps=120 * num_held)
+    result = hindrl.fit(holds, record_gymnasium(env, to_goal, 5, seed=1), config)
+    episodes = jax.device_get(result.state.replay).episodes
+    assert set(episodes.lengths[0].tolist()) <= {0, -(-10 // num_held)}
+    assert not episodes.terminated.any()
+    assert episodes.rewards[0, :, :-1].any()
+    assert episodes.rewards.max() == 1.0
     assert {row.episode_length for row in result.rows} == {10.0}
+
+
+def test_demonstrations_of_goals_that_are_held_are_worth_what_rollouts_are(env):
+    """Whether they ended at the goal or not, and whatever the number of control steps of a decision."""
+    holds = dataclasses.replace(env, success="held")
     recorded = jax.tree.map(jnp.asarray, record_gymnasium(holds, to_goal, 5, seed=1))
     rows, steps = jnp.zeros(10, jnp.int32), jnp.arange(10)
-    config = with_batch(CONFIG, gamma=0.5, n_step=1)
+    config = with_batch(CONFIG, gamma=0.5, n_step=2)
+    following = np.append(recorded.rewards[0, 1:], 0.0)  # nothing follows the last step
     for table in (recorded, recorded.replace(terminated=jnp.zeros(5, bool))):
         batch = rows_of_demonstrations(table, rows, steps, holds, config)
-        np.testing.assert_allclose(batch.reward, 0.5 * recorded.rewards[0])
-        np.testing.assert_allclose(batch.discount, 0.5)
+        np.testing.assert_allclose(batch.reward, 0.5 * recorded.rewards[0] + 0.25 * following)
+        np.testing.assert_allclose(batch.discount, np.where(np.arange(10) == 9, 0.5, 0.25))
+
+
+def test_a_goal_that_moves_within_an_episode_is_no_goal_to_be_held():
+    moving = Simulators(hindrl.make(POINT, success="held", moves=True), 2)
+    moving.begin(np.array([1, 2]))
+    with pytest.raises(SimulationFailed, match=r"changed the desired goal at step 1 of an episode that went on.*--success reached"):
+        moving.step(np.zeros((2, 2)))
+    moving.close()
 
 
 def test_a_policy_that_reaches_nothing_is_told_so(env):
