@@ -26,7 +26,7 @@ class Odd(gymnasium.Env):
         dtype: str = "float32",
         reward: str = "float",
         says: str = "is_success",
-        success: str = "bool",
+        truth: str = "bool",
         threshold: Any = 0.35,
         signature: str = "new",
         fault: str | None = None,
@@ -34,7 +34,7 @@ class Odd(gymnasium.Env):
         episode: int = 1,
         render_mode: str | None = None,
     ):
-        self.dims, self.dtype, self.reward, self.says, self.success = dims, np.dtype(dtype), reward, says, success
+        self.dims, self.dtype, self.reward, self.says, self.truth = dims, np.dtype(dtype), reward, says, truth
         self.signature, self.fault, self.when, self.distance_threshold = signature, fault, when, threshold
         self.episode, self.episodes = episode, 0
         place = Box(-2.0, 2.0, (dims,), self.dtype)
@@ -90,9 +90,7 @@ class Odd(gymnasium.Env):
         return np.linalg.norm(np.asarray(one, float) - other, axis=-1)
 
     def said(self, reached):
-        return {"bool": reached, "float": float(reached), "array": np.array([reached]), "int": int(reached), "numpy": np.float32(reached)}[
-            self.success
-        ]
+        return {"bool": reached, "float": float(reached), "array": np.array([reached]), "int": int(reached), "numpy": np.float32(reached)}[self.truth]
 
     def compute_reward(self, achieved_goal, desired_goal, info):
         reward = np.where(self.distance(achieved_goal, desired_goal) <= self.radius, 0.1, -0.9)

@@ -16,8 +16,8 @@ class QuirksConfig:
     """A goal counts as reached at distance < epsilon, as in the thesis's formula and code, not <=. With epsilon 0 it never does. The filter of
     demonstrated goals keeps what is farther than epsilon all the same, as in the code."""
     bootstrap_past_relabelled_goals: bool = False
-    """Reaching a relabelled goal does not end the return, as in the thesis, so that values can exceed 1. Where goals are to be held it never does. Where
-    hindsight relabels observations in place of goals (ParameterizedReach), a solved task always ends it."""
+    """Reaching a relabelled goal does not end the return, as in the thesis, so that values can exceed 1. Where goals are to be held it never does.
+    Where hindsight relabels observations in place of goals (ParameterizedReach), a solved task always ends it."""
     timeouts_are_terminal: bool = False
     """Treat episodes that are cut by the horizon as terminated, as the original code does by mistake."""
     exclude_last_goal: bool = False

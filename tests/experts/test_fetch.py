@@ -30,7 +30,8 @@ def test_demonstrations_reach_their_goals_soon(name, expert, dims):
     demonstrations = hindrl.record_demonstrations(env, 6)
     last = demonstrations.observations[np.arange(6), demonstrations.lengths]
     assert (np.linalg.norm(env.achieved_goal(last) - demonstrations.desired_goals, axis=1) <= 0.05).all()
-    assert demonstrations.lengths.max() <= 45
+    assert demonstrations.lengths.tolist() == [50] * 6  # they stay at their goals, to the end
+    assert demonstrations.rewards.argmax(axis=1).max() < 45
     assert np.abs(demonstrations.actions).max() <= 1.0
 
 
@@ -43,7 +44,7 @@ def test_nearly_every_episode_is_solved(expert):
 
 def test_two_pucks_in_five_or_more_are_hit_to_their_goals():
     """Some goals are out of reach. Of 100 episodes it was 60; a hit in a wrong direction reaches one goal in ten."""
-    env = hindrl.make("gymnasium:FetchSlide-v4")
+    env = hindrl.make("gymnasium:FetchSlide-v4", success="reached")
     hindrl.record_gymnasium(env, FetchSlideExpert().act, 8, seed=1, max_attempts=20)
 
 

@@ -30,7 +30,7 @@ def environments(draw):
         dtype=draw(st.sampled_from(["float32", "float64"])),
         reward=draw(st.sampled_from(["float", "float32", "array"])),
         says=draw(st.sampled_from(["is_success", "success", "reward"])),
-        success=draw(st.sampled_from(["bool", "float", "array", "int", "numpy"])),
+        truth=draw(st.sampled_from(["bool", "float", "array", "int", "numpy"])),
         threshold=draw(st.sampled_from([0.35, 0.05, 1e-7, 5.0, None, 0.0])),
         signature=draw(st.sampled_from(["new"] * 6 + list(SIGNATURES))),
         fault=fault,

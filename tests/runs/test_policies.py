@@ -16,7 +16,7 @@ from tiny import CONFIG, ENV
 
 import hindrl_jax as hindrl
 from hindrl_jax.base.environments import action_from_env
-from hindrl_jax.config import QuirksConfig
+from hindrl_jax.config import GoalConfig, QuirksConfig
 from hindrl_jax.core import agent, losses
 from hindrl_jax.core.goals import GoalTable
 from hindrl_jax.core.holding import hold
@@ -27,11 +27,14 @@ from hindrl_jax.runs.reader import Run
 from hindrl_jax.runs.spec import RunSpec
 
 POINT, FLAT = "gymnasium:point_env:PointGoal-v0", "gymnasium:flat_env:PointFlat-v0"
+OWN_GOALS = GoalConfig(behavioural_goals="environment")
 
 
 def untrained(env=ENV, noise=0.0, **agent_fields):
     """A run of two seeds, 5 and 7, whose policies and critics are as they begin, in a task; other fields of the config beside those of its agent."""
-    others = {name: agent_fields.pop(name) for name in ("action_hold", "action_chunks", "imitation_proposal", "quirks") if name in agent_fields}
+    others = {
+        name: agent_fields.pop(name) for name in ("action_hold", "action_chunks", "imitation_proposal", "quirks", "goal") if name in agent_fields
+    }
     config = dataclasses.replace(CONFIG, **others, agent=dataclasses.replace(CONFIG.agent, net_arch=(6, 6), **agent_fields))
     decisions = hold(env, config.num_held, chunks=config.action_chunks)
     rng = np.random.default_rng(0)
@@ -57,7 +60,7 @@ CASES = {
     "residual": dict(residual=True),
     "held": dict(action_hold=3),
     "chunks": dict(action_hold=3, action_chunks=True),
-    "with goals of its own": dict(env=POINT),
+    "with goals of its own": dict(env=POINT, goal=OWN_GOALS),
     "flat": dict(env=FLAT),
 }
 
@@ -101,7 +104,7 @@ def test_whole_numbers_are_given_where_a_task_takes_such():
 
 
 def test_a_run_whose_networks_saw_goals_otherwise_is_refused():
-    written = untrained(hindrl.make(POINT)).spec.to_json()
+    written = untrained(hindrl.make(POINT), goal=OWN_GOALS).spec.to_json()
     assert RunSpec.from_json(written, "config.json").env == hindrl.make(POINT)
     del written["env_args"]["success"]
     with pytest.raises(hindrl.UserError, match=r"networks saw goals otherwise .* so its policies would be misread: train again"):

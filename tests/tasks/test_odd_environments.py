@@ -95,7 +95,7 @@ def test_what_cannot_be_learnt_in_is_refused_before_anything_is_computed(argumen
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("arguments", [{"success": kind} for kind in ("bool", "float", "array", "int", "numpy")] + [{"says": "success"}])
+@pytest.mark.parametrize("arguments", [{"truth": kind} for kind in ("bool", "float", "array", "int", "numpy")] + [{"says": "success"}])
 @pytest.mark.parametrize("num_held", [1, 2])
 def test_success_is_read_however_it_is_said(arguments, num_held):
     plain, odd = (hindrl.make(ODD, **given).stepper(3, num_held=num_held) for given in ({}, arguments))
