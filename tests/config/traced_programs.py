@@ -6,7 +6,7 @@ import re
 
 import jax
 import numpy as np
-from flax.errors import ScopeParamShapeError
+from flax.errors import FlaxError
 from jax.interpreters import partial_eval
 from toy_env import Corridor, corridor_demonstrations
 
@@ -121,7 +121,7 @@ class Program:
         The parts named `first` come before the others, given what they are given here: where a change shows in them, it is as good as found.
         """
         for name in self.parts.keys() & set(first):
-            with contextlib.suppress(TypeError, ValueError, ScopeParamShapeError):  # it wants other shapes
+            with contextlib.suppress(TypeError, ValueError, FlaxError):  # it wants other shapes
                 if Traced(getattr(Stages(config), name), self.values, self.given[name], self.parts[name].used_outputs).text != self.parts[name].text:
                     return True
         arguments = self.ARGUMENTS
