@@ -1,15 +1,13 @@
 """Commands: of a training that takes seconds, and such that must be refused."""
 
-import shlex
-
 import pytest
 
 from hindrl_jax import cli
 
-TINY = shlex.split(
-    "--num-envs 2 --learning-starts 200 --steps 260 --eval-every 40 --eval-episodes 3 --updates-per-iteration 1 "
-    "--batch-size 16 --net-arch 8 --buffer-size 2000"
-)
+SIZES = dict(num_envs=2, learning_starts=200, steps=260, eval_every=40, eval_episodes=3, updates_per_iteration=1, buffer_size=2000)
+BATCH_SIZE, WIDTH = 16, 8
+TINY = [text for name, value in SIZES.items() for text in (f"--{name.replace('_', '-')}", str(value))]
+TINY += ["--batch-size", str(BATCH_SIZE), "--net-arch", str(WIDTH)]
 
 
 def refusal(capsys, *arguments) -> str:

@@ -3,6 +3,8 @@
 import dataclasses
 from typing import Any
 
+from commands import BATCH_SIZE, SIZES, WIDTH
+
 from hindrl_jax.base.environments import Environment
 from hindrl_jax.tasks import presets
 
@@ -14,15 +16,9 @@ def preset(algo: str = "hindrl", name: str = "default", *, env: str | Environmen
     config = _full(algo, name, env=env)
     return dataclasses.replace(
         config,
-        steps=260,
-        num_envs=2,
-        updates_per_iteration=1,
-        learning_starts=200,
-        buffer_size=2000,
-        eval_every=40,
-        eval_episodes=3,
-        batch=dataclasses.replace(config.batch, batch_size=16),
-        agent=dataclasses.replace(config.agent, net_arch=(8,)),
+        **SIZES,
+        batch=dataclasses.replace(config.batch, batch_size=BATCH_SIZE),
+        agent=dataclasses.replace(config.agent, net_arch=(WIDTH,)),
     )
 
 

@@ -96,3 +96,8 @@ class Watchable(HostStepped, Protocol):
 def can_step_on_host(env: Any) -> TypeGuard[HostStepped]:
     """Whether the environment can be stepped outside JAX, many at once, with the back end that it has now."""
     return isinstance(env, HostStepped) and getattr(env, "steps_on_host", True)
+
+
+def gives_goals(env: Any) -> bool:
+    """Whether each episode comes with a goal of the environment's own, which only those that are stepped outside JAX have."""
+    return can_step_on_host(env) and env.gives_goals

@@ -86,7 +86,8 @@ def network_inputs(observation: Array, achieved_goal: Array, desired_goal: Array
     The multiscale encoding gives each dimension twice: standardised, for where in the task it is; and saturating around 0 in units of its root mean
     square, so that where a dimension is a distance, "exactly there" and "one step off" are far apart. Small networks blur the two else.
     """
-    goals = [achieved_goal, desired_goal] if config.quirks.achieved_goal_input else [seen_goal(achieved_goal, desired_goal, config)]
-    goals = [_encode(goal, scale.goal_centre, scale.goal, config.agent) for goal in goals]
     observation = _encode(observation, scale.observation_centre, scale.observation, config.agent)
-    return jnp.concatenate([*goals, observation] if config.quirks.achieved_goal_input else [observation, *goals], axis=-1)
+    goal = _encode(seen_goal(achieved_goal, desired_goal, config), scale.goal_centre, scale.goal, config.agent)
+    if config.quirks.achieved_goal_input:
+        return jnp.concatenate([_encode(achieved_goal, scale.goal_centre, scale.goal, config.agent), goal, observation], axis=-1)
+    return jnp.concatenate([observation, goal], axis=-1)

@@ -188,14 +188,12 @@ def numpy_form(trained: TrainedPolicy) -> tuple[dict[str, np.ndarray], dict[str,
         "encoding": config.agent.input_encoding,
         "depth": len(config.agent.net_arch),
         "residual": config.agent.residual,
-        "relative_goals": config.relative_goals,
+        "achieved": _entries_of_achieved_goal(env) if config.relative_goals else None,
         "action_hold": trained.action_hold,
         "chunks": trained.chunks,
         "noise": trained.noise,
         "whole_actions": takes_whole_actions(env),
     }
-    if config.relative_goals:
-        facts["achieved"] = _entries_of_achieved_goal(env)
     scale = trained.policy.scale
     low, high = (np.broadcast_to(bound, (env.action_dim,)) for bound in (env.action_low, env.action_high))
     arrays = {

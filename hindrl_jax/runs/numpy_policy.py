@@ -72,7 +72,7 @@ class NumpyPolicy:
         if goal is None and self.goal is None:
             raise ValueError(f"{self.task} has a goal of its own in each episode: give it, as policy(observation, goal)")
         goal = _checked(self.goal if goal is None else goal, arrays["goal_scale"].size, "a goal", self.task)
-        if self._facts["relative_goals"]:
+        if self._facts["achieved"] is not None:  # the networks see what is left to the goal
             goal = goal - observation[..., self._facts["achieved"]]
         leading = np.broadcast_shapes(observation.shape[:-1], goal.shape[:-1])
         parts = [self._encoded("observation", observation), self._encoded("goal", goal)]

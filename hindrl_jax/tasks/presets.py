@@ -35,7 +35,7 @@ import numpy as np
 
 from hindrl_jax.base.environments import Environment, RelabelsObservations
 from hindrl_jax.base.errors import UserError
-from hindrl_jax.base.steppers import can_step_on_host
+from hindrl_jax.base.steppers import gives_goals
 from hindrl_jax.config import AgentConfig, Algorithm, BatchConfig, GoalConfig, QuirksConfig, TrainConfig
 from hindrl_jax.envs.cable import CableTask
 from hindrl_jax.envs.reach import ReachTask
@@ -98,20 +98,16 @@ def _default(algo: Algorithm, env: Environment) -> TrainConfig:
 
 def _batch(env: Environment) -> BatchConfig:
     """Where hindsight turns an episode into one of another task that is to be learnt, too, more is relabelled, and with goals of both sources."""
-    if _gives_goals(env):
+    if gives_goals(env):
         return BatchConfig(relabelled_per_original=4.0, hindrl_sampling_strategy="joint_union")
     if isinstance(env, RelabelsObservations):
         return BatchConfig(relabelled_per_original=1.0, hindrl_sampling_strategy="joint_union")
     return BatchConfig()
 
 
-def _gives_goals(env: Environment) -> bool:
-    return can_step_on_host(env) and env.gives_goals
-
-
 def _goals(env: Environment) -> GoalConfig:
     """Goals and epsilon, by what the environment is."""
-    if _gives_goals(env):
+    if gives_goals(env):
         tolerance = getattr(env, "goal_tolerance", None)
         return GoalConfig(behavioural_goals="environment", epsilon=None if tolerance is None else _rounded_down(np.min(tolerance)))
     return GoalConfig(behavioural_goals="task" if isinstance(env, RelabelsObservations | GymnasiumEnv) else "final_demonstration_states")

@@ -16,7 +16,7 @@ import numpy as np
 
 from hindrl_jax.base.environments import Environment, RelabelsObservations, Restorable, backends_with, can_step, state_dim
 from hindrl_jax.base.errors import UserError, one_line
-from hindrl_jax.base.steppers import can_step_on_host
+from hindrl_jax.base.steppers import can_step_on_host, gives_goals
 from hindrl_jax.base.types import Episodes
 from hindrl_jax.config import RESIDUAL_EXPANSION, SWEEPABLE, TrainConfig, sweepable_value, with_traced_values
 from hindrl_jax.core.train import warm_up_iterations
@@ -119,12 +119,12 @@ def check_config(env: Environment, config: TrainConfig) -> None:
     """
     name, goal = env.name, config.goal
     in_jax = can_step(env)
-    gives_goals = not in_jax and can_step_on_host(env) and env.gives_goals
-    if gives_goals and goal.behavioural_goals != "environment":
+    own_goals = not in_jax and gives_goals(env)
+    if own_goals and goal.behavioural_goals != "environment":
         raise UserError(
             f"behavioural_goals = {goal.behavioural_goals} cannot be had in {name}, whose episodes come with goals of their own: choose environment"
         )
-    if not gives_goals and goal.behavioural_goals == "environment":
+    if not own_goals and goal.behavioural_goals == "environment":
         raise UserError(f"behavioural_goals = environment cannot be had in {name}, which gives its episodes no goals: choose another")
     if isinstance(env, RelabelsObservations):
         if config.batch.uses_intersections:

@@ -6,7 +6,7 @@ import numpy as np
 
 from hindrl_jax.base.environments import Environment, holds_goal
 from hindrl_jax.base.errors import UserError
-from hindrl_jax.base.steppers import can_step_on_host
+from hindrl_jax.base.steppers import gives_goals
 from hindrl_jax.base.types import Episodes
 
 
@@ -23,19 +23,16 @@ def as_judged_by(env: Environment, demonstrations: Episodes) -> Episodes:
     Raises:
       UserError: if the goal is to be held, and a reward is neither 0 nor 1.
     """
-    if not (can_step_on_host(env) and env.gives_goals):
+    if not gives_goals(env):
         return demonstrations
     rewards = np.where(_taken(demonstrations), demonstrations.rewards, 0.0)
-    says_success = np.isin(rewards, (0.0, 1.0)).all()
-    if holds_goal(env):
-        if not says_success:
-            found = rewards[~np.isin(rewards, (0.0, 1.0))][0]
-            raise UserError(
-                f"a demonstration has a reward of {found:g}, and {env.name}, where the goal is to be held, takes 1 at the goal and 0 elsewhere: "
-                "convert with --sparse-rewards, or choose success = reached"
-            )
-        return demonstrations
-    if not says_success:
+    says_success = np.isin(rewards, (0.0, 1.0))
+    if holds_goal(env) and not says_success.all():
+        raise UserError(
+            f"a demonstration has a reward of {rewards[~says_success][0]:g}, and {env.name}, where the goal is to be held, takes 1 at the goal and 0 "
+            "elsewhere: convert with --sparse-rewards, or choose success = reached"
+        )
+    if holds_goal(env) or not says_success.all():
         return demonstrations
     lengths = steps_to_goal(demonstrations)
     last = np.arange(rewards.shape[-1]) == lengths[..., None] - 1
