@@ -11,7 +11,8 @@ learners are judged by the same fresh episodes, `peers/episodes.py`; seconds cou
 not.
 
 Learners are `hindrl` and `bc`, ours by the default recipe, with demonstrations of the task's expert; `sb3`, TQC with hindsight by the settings of the
-RL Zoo; and `sb3-demos`, the same with those demonstrations in its replay buffer.
+RL Zoo; `sbx`, the same algorithm in JAX with networks and batches of a size for CPUs; and `sb3-demos` and `sbx-demos`, with those demonstrations in
+their replay buffers.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from hindrl_jax.plotting.figures import colours, figure, legend_beside, mark_suc
 
 TASKS = {"FetchReach": (5_000, 500), "FetchPush": (75_000, 5_000), "FetchPickAndPlace": (150_000, 10_000), "FetchSlide": (500_000, 25_000)}
 """Environment steps of a run, and between two evaluations."""
-LEARNERS = ("hindrl", "bc", "sb3", "sb3-demos")
+LEARNERS = ("hindrl", "bc", "sbx-demos", "sbx", "sb3-demos", "sb3")
 SOLVED = 0.95
 VERSION, MODULE = "v4", "gymnasium_robotics"
 
@@ -72,7 +73,7 @@ class Cell:
 
     @property
     def ours(self) -> bool:
-        return not self.learner.startswith("sb3")
+        return self.learner in ("hindrl", "bc")
 
 
 def arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
@@ -99,7 +100,7 @@ def main() -> None:
     if not given.only_report:
         seeds = range(given.seed, given.seed + given.seeds)
         for task, seed, learner in itertools.product(given.tasks, seeds, given.learners):
-            cell = Cell(task, learner, 0 if learner == "sb3" else given.demos, seed)
+            cell = Cell(task, learner, 0 if learner in ("sb3", "sbx") else given.demos, seed)
             if not cell.ours and not given.peers.exists():
                 print(f"{cell.name}: left out, {given.peers} is not there: `make bench` installs the peers; or name their interpreter with --peers")
                 continue
@@ -143,7 +144,8 @@ def run(cell: Cell, given: argparse.Namespace) -> Row:
     if cell.ours:
         command = [sys.executable, "-m", "benchmarks.solve_ours", "--algo", cell.learner, *command]
     else:
-        command = [given.peers, FOLDER / "peers/solve_sb3.py", *command]
+        library = "sbx" if cell.learner.startswith("sbx") else "sb3_contrib"
+        command = [given.peers, FOLDER / "peers/solve_sb3.py", "--library", library, *command]
     errors = given.out / f"{cell.name}.log"
     busy = os.getloadavg()[0] / (os.cpu_count() or 1)
     with errors.open("w") as log:

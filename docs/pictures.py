@@ -1,8 +1,9 @@
 """Draws the pictures of README and of the pages: docs/how_it_works.png, environments.png, epsilon_filter.png, cable_expert.png, values.png and, of
-the runs that are there, docs/panda.gif, docs/grid.gif and docs/grid_curve.png.
+the runs that are there, docs/panda.gif, docs/grid.gif, docs/fetch.gif and docs/grid_curve.png. docs/gallery.md shows them together.
 
     hindrl train --env FixedGridPickAndPlace --demos 1 --seed 2 --stop-at 0.98 --out runs/quickstart
     hindrl train --env FixedParameterizedReach --demos 1 --seed 0 --stop-at 0.98 --out runs/reach
+    hindrl train --env gymnasium:FetchPickAndPlace-v4 --demos 20 --seed 0 --steps 100000 --stop-at 0.95 --out runs/fetch
     python docs/pictures.py
 """
 
@@ -16,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import matplotlib
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from hindrl_jax import cli
 from hindrl_jax.envs.cable import viewer as cable_viewer
@@ -42,9 +43,11 @@ def main() -> None:
     epsilon_filter(DOCS / "epsilon_filter.png")
     values(DOCS / "values.png")
     cable_expert(DOCS / "cable_expert.png")
-    for run, film in (("reach", "panda.gif"), ("quickstart", "grid.gif")):
+    for run, film in (("reach", "panda.gif"), ("quickstart", "grid.gif"), ("fetch", "fetch.gif")):
         if (RUNS / run).is_dir():
             cli.main(["render", str(RUNS / run), "--to", str(DOCS / film)])
+            if run == "fetch":
+                crop(DOCS / film, (0, 70, 400, 470))
     if (RUNS / "quickstart").is_dir():
         shutil.copy(RUNS / "quickstart" / "curve.png", DOCS / "grid_curve.png")
 
@@ -131,6 +134,14 @@ def values(path: Path) -> None:
     figure.colorbar(shown, label="value")
     figure.savefig(path, facecolor="white")
     plt.close(figure)
+
+
+def crop(path: Path, box: tuple[int, int, int, int]) -> None:
+    """Cuts a film to a part of its frames: left, top, right and bottom, pixels."""
+    with Image.open(path) as film:
+        frames = [each.convert("RGB").crop(box).quantize(64) for each in ImageSequence.Iterator(film)]
+        durations = [each.info["duration"] for each in ImageSequence.Iterator(film)]
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0)
 
 
 def epsilon_filter(path: Path) -> None:

@@ -11,8 +11,9 @@ from hindrl_jax.config.batch import BatchConfig
 from hindrl_jax.config.goal import GoalConfig
 from hindrl_jax.config.quirks import QuirksConfig
 
-STEPS_PER_UPDATE = 4
-"""Control steps for each gradient step, where the config does not say how many of these there are."""
+STEPS_PER_UPDATE, STEPS_PER_UPDATE_OWN_GOALS = 4, 2
+"""Control steps for each gradient step, where the config does not say how many of these there are: in general, and where episodes have goals of their
+own, since hindsight makes more rows of each step there."""
 FEWEST_STEPS, DECISIONS = 100_000, 50_000
 """Environment steps of a run, where the config does not say how many: at least so many, and enough for so many decisions."""
 Algorithm = Literal["bc", "tqcfd", "hindrl", "smooth-hindrl"]
@@ -36,7 +37,8 @@ class TrainConfig:
     """Each decision is as many different actions in place of one that is held, played one after the other, and the critics value all of them together
     (Q-chunking; Li, Zhou and Levine, 2025). action_hold says how many."""
     updates_per_iteration: int | None = None
-    """Gradient steps after each decision of all environments; None takes one for every 4 control steps."""
+    """Gradient steps after each decision of all environments; None takes one for every 4 control steps, for every 2 where episodes have goals of
+    their own."""
     learning_starts: int = 0
     """Environment steps with uniformly random actions before the first gradient step; at least one horizon in each environment is taken."""
     demo_reset_ratio: float = 0.0
@@ -127,12 +129,18 @@ class TrainConfig:
     @property
     def num_updates(self) -> int:
         """Gradient steps for each decision of all environments."""
-        return self.updates_per_iteration or max(1, round(self.steps_per_iteration / STEPS_PER_UPDATE))
+        steps_per_update = STEPS_PER_UPDATE_OWN_GOALS if self.own_goals else STEPS_PER_UPDATE
+        return self.updates_per_iteration or max(1, round(self.steps_per_iteration / steps_per_update))
+
+    @property
+    def own_goals(self) -> bool:
+        """Whether each episode aims at a goal that the environment gives it, as Gymnasium's do with a `desired_goal`."""
+        return self.goal.behavioural_goals == "environment"
 
     @property
     def relative_goals(self) -> bool:
         """Whether networks see what is left to the goal, desired less achieved, in place of the goal: where each episode has one of its own."""
-        return self.goal.behavioural_goals == "environment" and not self.quirks.achieved_goal_input
+        return self.own_goals and not self.quirks.achieved_goal_input
 
     @property
     def clones_first(self) -> bool:

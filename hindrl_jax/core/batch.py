@@ -118,5 +118,5 @@ def goal_test(guidance: Guidance, env: Environment, config: TrainConfig) -> Goal
         epsilon=guidance.epsilon,
         inclusive=not config.quirks.strict_goal_test,
         ends_return=not (config.quirks.bootstrap_past_relabelled_goals or holds_goal(env)),
-        own_goals=config.goal.behavioural_goals == "environment",
+        own_goals=config.own_goals,
     )

@@ -64,7 +64,7 @@ def guidance(demonstrations: Episodes, env: Environment, config: TrainConfig) ->
 
 def _behavioural_goals(demonstrations: Episodes, achieved: Array, env: Environment, config: TrainConfig) -> tuple[GoalTable, Array]:
     """The goals of rollouts, and (N, G) the goals that rows of the demonstrations are given in place of the recorded ones."""
-    if config.goal.behavioural_goals == "environment":
+    if config.own_goals:
         desired_goals = demonstrations.desired_goals
         return GoalTable(goals=desired_goals, count=jnp.asarray(desired_goals.shape[0])), desired_goals
     table = goals.final_goals(achieved, demonstrations.lengths)

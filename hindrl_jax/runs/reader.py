@@ -66,7 +66,7 @@ class Run:
         """
         index, (env, config) = self._index_of(seed), (self.spec.env, self.spec.config)
         policy, goals = jax.tree.map(lambda leaf: leaf[index], (self.policies, self.behavioural_goals))
-        own_goals = getattr(env, "gives_goals", False) or config.goal.behavioural_goals == "environment"
+        own_goals = getattr(env, "gives_goals", False) or config.own_goals
         return TrainedPolicy(env, config, policy, None if own_goals else goals.goals[0])
 
     def value(self, seed: int | None = None) -> TrainedValue:

@@ -78,7 +78,7 @@ class RunSpec:
         if not (isinstance(seeds, list) and seeds and all(type(seed) is int and 0 <= seed < 2**32 for seed in seeds)):
             raise UserError(f"{where}: seeds = {seeds!r} is not usable: it must be a list of whole numbers from 0 to {2**32 - 1}")
         env, config = make(data["env"], **env_args), _config_from_dict(TrainConfig, data["config"], "config", where)
-        if config.goal.behavioural_goals == "environment" and hasattr(env, "success") and "success" not in env_args:
+        if config.own_goals and hasattr(env, "success") and "success" not in env_args:
             raise UserError(
                 f"{where} is of a version in which networks saw goals otherwise and episodes ended at them, so its policies would be misread: train "
                 f'again, from flags or with "success": "reached" among its env_args'

@@ -9,7 +9,7 @@ The default is `TrainConfig()`, for bc with two wide layers and few steps, whate
 they are and from the demonstrations:
 
     action_hold            from the median length of the demonstrations (`core.holding.longest_hold`)
-    updates_per_iteration  one gradient step for every 4 environment steps
+    updates_per_iteration  one gradient step for every 4 environment steps; for every 2 where episodes have goals of their own
     input scales, epsilon  from the demonstrations (`core.inputs.input_scale`, thesis eq. 4.7); epsilon is the tolerance of the environment where
                            episodes come with its goals and it tells one
     behavioural goals      those that episodes come with; else the task's one goal where hindsight relabels observations, and the mean of the
