@@ -14,8 +14,8 @@ from typing import Any
 import nbformat
 
 FOLDER = Path(__file__).parent.parent / "notebooks"
-EXECUTED = ("01_quickstart", "02_your_own_task", "04_goals_and_epsilon", "07_thesis")
-"""Those that are stored with their outputs. The others train for longer, and the films of the two arms are too large for git."""
+EXECUTED = ("01_quickstart", "02_your_own_task", "03_your_own_demonstrations", "04_goals_and_epsilon", "05_many_seeds_and_settings", "07_thesis")
+"""Those that are stored with their outputs; the films of the two arms are too large for git."""
 CODE = "outputs_of_code"
 """The entry of a notebook's metadata that says which code its outputs are of."""
 

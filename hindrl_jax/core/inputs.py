@@ -10,10 +10,12 @@ from hindrl_jax.config import AgentConfig, TrainConfig
 
 _LEAST_EXTENT = 1e-6
 _LEAST_DEVIATION = 0.1  # of the root mean square
+_MOST_DEVIATIONS = 100.0  # a block that the demonstrations never turn, and a rollout does, would else be at a million
 
 
 class InputScale(struct.PyTreeNode, kw_only=True):
-    """Where each input dimension lies in the demonstrations and how large it is; the encodings other than raw see (x - centre) / scale."""
+    """Where each input dimension lies in the demonstrations and how large it is; the encodings other than raw see (x - centre) / scale, from -100
+    to 100."""
 
     observation: Array  # (D,) scale, > 0
     goal: Array  # (G,)
@@ -64,7 +66,7 @@ def _encode(values: Array, centre: Array, scale: Array, config: AgentConfig) -> 
         return values
     leading = (1,) * (values.ndim - 1)
     centre, scale = centre.reshape(leading + centre.shape), scale.reshape(leading + scale.shape)
-    standardised = (values - centre) / scale
+    standardised = jnp.clip((values - centre) / scale, -_MOST_DEVIATIONS, _MOST_DEVIATIONS)
     if config.input_encoding == "standardised":
         return standardised
     return jnp.concatenate([standardised, jnp.tanh(4.0 * values / jnp.sqrt(jnp.square(scale) + jnp.square(centre)))], axis=-1)

@@ -23,6 +23,7 @@ import numpy as np
 FORMAT = 2
 _LOG_STD_MIN, _LOG_STD_MAX = -20.0, 2.0
 _LAYER_NORM_EPSILON = 1e-6
+_MOST_DEVIATIONS = 100.0
 
 
 class NumpyPolicy:
@@ -91,7 +92,7 @@ class NumpyPolicy:
         if self._facts["encoding"] == "raw":
             return values
         centre, scale = self._arrays[f"{name}_centre"], self._arrays[f"{name}_scale"]
-        standardised = (values - centre) / scale
+        standardised = np.clip((values - centre) / scale, -_MOST_DEVIATIONS, _MOST_DEVIATIONS)
         if self._facts["encoding"] == "standardised":
             return standardised
         return np.concatenate([standardised, np.tanh(4.0 * values / np.sqrt(np.square(scale) + np.square(centre)))], axis=-1)

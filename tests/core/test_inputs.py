@@ -47,6 +47,14 @@ def test_goals_of_the_environments_own_are_seen_from_where_one_is(encoding, expe
     np.testing.assert_allclose(network_inputs(jnp.array([1.0, 2.0]), jnp.array([8.0]), jnp.array([5.0]), scale, config), expected, rtol=1e-6)
 
 
+@pytest.mark.parametrize(("encoding", "seen"), [("standardised", [100.0, -100.0, 99.0]), ("multiscale", [100.0, -100.0, 99.0, 1.0, -1.0, 1.0])])
+def test_what_lies_far_outside_the_demonstrations_is_seen_at_a_hundred_deviations(encoding, seen):
+    scale = InputScale(observation=jnp.full(3, 1e-6), goal=jnp.ones(0), observation_centre=jnp.zeros(3), goal_centre=jnp.zeros(0))
+    config = TrainConfig(agent=AgentConfig(input_encoding=encoding))
+    inputs = network_inputs(jnp.array([0.7, -0.7, 99e-6]), jnp.zeros(0), jnp.zeros(0), scale, config)
+    np.testing.assert_allclose(inputs, seen, rtol=1e-5)
+
+
 @pytest.mark.parametrize("padding", [7.0, np.nan])
 @pytest.mark.parametrize(
     ("encoding", "centre", "size"),
