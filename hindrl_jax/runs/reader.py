@@ -193,7 +193,7 @@ class Run:
           noise: of the actions, 0 for the mean ones, 1 for sampled ones; None for what the run has found to be best.
 
         Returns:
-          A table of N episodes with their states, repeated after the end.
+          A table of N episodes with their states, repeated after the end. Environments of Gymnasium have no states, and zeros after the end.
 
         Raises:
           UserError: if the run has no such seed.

@@ -6,12 +6,13 @@ import dataclasses
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from hindrl_jax.base.environments import Environment, action_to_env
+from hindrl_jax.base.environments import Environment, action_from_env, action_to_env
 from hindrl_jax.base.steppers import HostStepped, Outcome, Stepper, WatchedStepper
-from hindrl_jax.base.types import Array
+from hindrl_jax.base.types import Array, Episodes
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.core.agent import Policy
 from hindrl_jax.core.goals import GoalTable
@@ -124,26 +125,64 @@ def play(stepper: Stepper, seeds: np.ndarray, act: HostAct, num_episodes: int) -
     return success, length
 
 
-def film(stepper: WatchedStepper, seed: int, act: HostAct, behavioural_goal: np.ndarray, num_held: int = 1) -> tuple[list[np.ndarray], bool]:
-    """Plays one episode: a picture (H, W, 3) uint8 of each state, and whether the task was solved.
+def play_one(
+    env: Environment,
+    stepper: WatchedStepper,
+    seed: int,
+    act: HostAct,
+    behavioural_goal: np.ndarray,
+    num_held: int = 1,
+    look: Callable[[], None] = lambda: None,
+) -> Episodes:
+    """Plays one episode, solved or not: a table of one, without states.
 
     Args:
-      stepper: one environment.
+      env: the task.
+      stepper: one environment of it.
       seed: which episode.
       act: the policy.
       behavioural_goal: (1, G), in the place of a goal of the episode's own where it has none.
       num_held: steps for which each action is held.
-
-    Raises:
-      UserError: if the environment draws no pictures.
+      look: called at the beginning and after every step.
     """
-    observation, goal = stepper.begin(np.array([seed]))
-    pictures = [stepper.picture()]
-    while True:
-        action = act(observation, behavioural_goal if goal is None else goal)
-        for _ in range(num_held):
-            outcome = stepper.step(action, autoreset=False)
-            pictures.append(stepper.picture())
-            if outcome.ended[0]:
-                return pictures, bool(outcome.success[0])
-        observation, goal = outcome.observation, outcome.desired_goal
+    observation, own_goal = stepper.begin(np.array([seed]))
+    goal = behavioural_goal if own_goal is None else own_goal
+    observations, actions, solved, ended = [observation], [], [], False
+    look()
+    while not ended:
+        if len(actions) % num_held == 0:
+            action = act(observations[-1], goal)
+        outcome = stepper.step(action, autoreset=False)
+        look()
+        observations.append(outcome.next_observation)
+        actions.append(action)
+        solved.append(outcome.success[0])
+        ended = outcome.ended[0]
+    episode = as_episode(env, np.concatenate(observations), np.concatenate(actions), np.array(solved), goal[0])
+    return jax.tree.map(lambda leaf: leaf[None], episode)
+
+
+def as_episode(env: Environment, observations: np.ndarray, actions: np.ndarray, solved: np.ndarray, goal: np.ndarray) -> Episodes:
+    """An episode of L steps as a row of a table, padded, without states.
+
+    Args:
+      env: the task.
+      observations: (L + 1, D)
+      actions: (L, A) in the environment's own units.
+      solved: (L,) bool, by each step.
+      goal: (G,)
+    """
+    length = len(actions)
+
+    def padded(rows: np.ndarray, size: int) -> np.ndarray:
+        return np.concatenate([rows, np.zeros((size - len(rows), *rows.shape[1:]), np.float32)])
+
+    return Episodes(
+        observations=padded(observations, env.horizon + 1),
+        actions=padded(np.asarray(action_from_env(jnp.asarray(actions), env)), env.horizon),
+        rewards=padded(solved.astype(np.float32), env.horizon),
+        lengths=np.int32(length),
+        terminated=solved[-1],
+        desired_goals=goal,
+        states=np.zeros((env.horizon + 1, 0), np.float32),
+    )

@@ -153,6 +153,8 @@ class TrainedPolicies:
     def player(self, index: int, num_episodes: int) -> Callable[[Array], Episodes]:
         """`player` of one policy. Each episode aims at a behavioural goal that is drawn for it."""
         env = self._decisions
+        if isinstance(self.env, Watchable) and not can_step(env):
+            return lambda key: self._play_on_host(jax.random.split(key, num_episodes), index)
         policy, goals = jax.tree.map(lambda leaf: leaf[index], (self.policies, self.behavioural_goals))
         choose = make_policy(policy, env, self.config)
 
@@ -175,19 +177,25 @@ class TrainedPolicies:
         """
         if not isinstance(self.env, Watchable):
             raise UserError(f"{self.env.name} does not draw itself: play it, and draw the states")
+        pictures: list[np.ndarray] = []
+        episodes = self._play_on_host(keys, index, pictures)
+        return pictures, int(episodes.terminated.sum())
+
+    def _play_on_host(self, keys: Array, index: int, pictures: list[np.ndarray] | None = None) -> Episodes:
+        """An episode for each of the keys (N,) with one policy, in an environment that is stepped outside JAX; pictures are added to those given."""
+        env: Any = self.env
         policy = jax.tree.map(lambda leaf: leaf[index : index + 1], self.policies)
         goals = jax.tree.map(lambda leaf: leaf[index], self.behavioural_goals)
-        host_policies = host_playing.HostPolicies(self.env, self.config, seed_mesh(1))
-        pictures, num_solved = [], 0
+        policies = host_playing.HostPolicies(env, self.config, seed_mesh(1))
+        episodes = []
         for key in keys:
             key_seed, key_act = jax.random.split(key)
-            act = host_policies.acting(key_act[None], policy)
+            act = policies.acting(key_act[None], policy)
             goal = np.asarray(sample_goals(jax.random.fold_in(key_act, 0), goals, 1))
-            with contextlib.closing(self.env.watched(with_pictures=True)) as stepper:
-                episode, solved = host_playing.film(stepper, int(jax.random.bits(key_seed)), act, goal, self.num_held)
-            pictures += episode
-            num_solved += solved
-        return pictures, num_solved
+            with contextlib.closing(env.watched(with_pictures=pictures is not None)) as stepper:
+                look = (lambda: None) if pictures is None else (lambda stepper=stepper: pictures.append(stepper.picture()))
+                episodes.append(host_playing.play_one(env, stepper, int(jax.random.bits(key_seed)), act, goal, self.num_held, look))
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *episodes)
 
     def _evaluate_in_jax(self, env: Steppable, keys: Array, num_episodes: int) -> Evaluation:
         """All episodes of all policies in one compiled program."""

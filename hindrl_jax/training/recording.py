@@ -12,13 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from hindrl_jax.base.compilation import in_float32
-from hindrl_jax.base.environments import Environment, action_from_env, can_step, state_dim
+from hindrl_jax.base.environments import Environment, can_step, state_dim
 from hindrl_jax.base.errors import UserError
-from hindrl_jax.base.steppers import HostStepped, Watchable
+from hindrl_jax.base.steppers import Watchable
 from hindrl_jax.base.types import Array, Episodes
 from hindrl_jax.tasks.registry import task
 from hindrl_jax.training.checks import check_demonstrations, check_dimensions, check_expert
 from hindrl_jax.training.devices import free_memory, seed_mesh
+from hindrl_jax.training.host_playing import as_episode
 from hindrl_jax.training.playing import player, plays_one_by_one
 
 Expert = Any
@@ -132,7 +133,7 @@ def record_gymnasium(env: Watchable, policy: Demonstrator, num_demos: int, *, se
                 ended = outcome.ended[0]
             if outcome.success[0]:
                 reached = np.asarray(env.achieved_goal(outcome.next_observation)) if goal is None else goal
-                kept.append(_demonstration(env, np.concatenate(observations), np.stack(actions), np.array(solved), reached[0]))
+                kept.append(as_episode(env, np.concatenate(observations), np.stack(actions), np.array(solved), reached[0]))
             observation, goal = outcome.observation, outcome.desired_goal
             if len(kept) == num_demos:
                 return jax.tree.map(lambda *leaves: np.stack(leaves), *kept)
@@ -152,21 +153,3 @@ def _checked(action: Any, env: Environment) -> np.ndarray:
     if action.shape != (env.action_dim,) or not np.isfinite(action).all():
         raise UserError(f"the policy chose {action.tolist()} in {env.name}, which takes {env.action_dim} finite numbers: mend the policy")
     return action
-
-
-def _demonstration(env: HostStepped, observations: np.ndarray, actions: np.ndarray, solved: np.ndarray, goal: np.ndarray) -> Episodes:
-    """A solved episode of L steps, padded: observations (L + 1, D), actions (L, A) in the environment's own units, solved (L,) bool, goal (G,)."""
-    length = len(actions)
-
-    def padded(rows: np.ndarray, size: int) -> np.ndarray:
-        return np.concatenate([rows, np.zeros((size - len(rows), *rows.shape[1:]), np.float32)])
-
-    return Episodes(
-        observations=padded(observations, env.horizon + 1),
-        actions=padded(np.asarray(action_from_env(jnp.asarray(actions), env)), env.horizon),
-        rewards=np.append(solved, np.zeros(env.horizon - length)).astype(np.float32),
-        lengths=np.int32(length),
-        terminated=np.bool_(True),
-        desired_goals=goal,
-        states=np.zeros((env.horizon + 1, 0), np.float32),
-    )

@@ -4,8 +4,10 @@ import dataclasses
 
 import jax
 import numpy as np
+import point_env
 import pytest
 from host_env import HostCorridor
+from point_env import to_goal
 from tiny import CONFIG, ENV
 from toy_env import Corridor, corridor_demonstrations
 
@@ -17,9 +19,9 @@ from hindrl_jax.tasks.registry import TASKS
 from hindrl_jax.training.playing import TrainedPolicies, player
 
 
-def trained(env, demonstrations, **changes):
+def trained(env, demonstrations, config=CONFIG, **changes):
     """Two untrained policies, and what they aim at."""
-    config = dataclasses.replace(CONFIG, algo="bc", **changes)
+    config = dataclasses.replace(config, algo="bc", **changes)
     table = demonstrations.replace(states=None)
     decisions = hold(env, config.num_held, chunks=True) if config.action_chunks else env
 
@@ -95,6 +97,31 @@ def test_what_steps_neither_in_jax_nor_many_at_once_is_played_by_the_tasks_own_p
 def test_what_has_no_states_is_not_played_with_them():
     with pytest.raises(hindrl.UserError, match="PointGoal-v0 cannot be played with its states: it has no step in JAX"):
         player(hindrl.make("gymnasium:point_env:PointGoal-v0"), lambda key, state, observation: observation, 1)
+
+
+@pytest.mark.parametrize("num_held", [1, 2])
+def test_episodes_outside_jax_are_what_the_policy_did_there(num_held):
+    """Each action moves the point by half of it, and is what the policy chose; a film of the same episodes ends as they do."""
+    env = hindrl.make("gymnasium:point_env:PointGoal-v0", horizon=7)
+    recorded = hindrl.record_gymnasium(env, to_goal, 2)
+    config = dataclasses.replace(point_env.CONFIG, action_hold=num_held)
+    policies = trained(env, jax.tree.map(jax.numpy.asarray, hold_demonstrations(recorded, num_held)), config)
+    episodes = policies.play(jax.random.key(3), 1, 4)
+    assert episodes.states.shape == (4, 8, 0)
+    choose = train.make_policy(jax.tree.map(lambda leaf: leaf[1], policies.policies), env, config)
+    for episode, length in enumerate(episodes.lengths):
+        seen, actions = episodes.observations[episode, : length + 1], episodes.actions[episode, :length]
+        np.testing.assert_allclose(seen[1:, 3:], np.clip(seen[:-1, 3:] + point_env.SPEED * actions, -1.0, 1.0), atol=1e-5)
+        decided = seen[np.arange(length) // num_held * num_held]
+        goals = np.tile(episodes.desired_goals[episode], (length, 1))
+        np.testing.assert_allclose(actions, choose(jax.random.key(0), decided, goals), atol=1e-5)
+        reached = np.linalg.norm(seen[1:, 3:] - episodes.desired_goals[episode], axis=1) <= 0.2
+        np.testing.assert_array_equal(episodes.rewards[episode, :length], reached)
+        assert episodes.terminated[episode] == reached[-1]
+        assert length == 7 or reached[-1]
+    assert len(np.unique(episodes.desired_goals, axis=0)) == 4
+    pictures, num_solved = policies.film(jax.random.split(jax.random.key(3), 4), 1)
+    assert (len(pictures), num_solved) == (episodes.lengths.sum() + 4, episodes.terminated.sum())
 
 
 def test_only_what_draws_itself_is_filmed():
