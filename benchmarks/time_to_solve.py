@@ -40,7 +40,16 @@ from hindrl_jax.plotting.figures import colours, figure, legend_beside, mark_suc
 
 TASKS = {"FetchReach": (5_000, 500), "FetchPush": (75_000, 5_000), "FetchPickAndPlace": (150_000, 10_000), "FetchSlide": (500_000, 25_000)}
 """Environment steps of a run, and between two evaluations."""
-LEARNERS = ("hindrl", "bc", "sbx-demos", "sbx", "sb3-demos", "sb3")
+LABELS = {
+    "hindrl": "ours, HinDRL",
+    "bc": "ours, behaviour cloning",
+    "sbx-demos": "SBX",
+    "sbx": "SBX",
+    "sb3-demos": "Stable-Baselines3",
+    "sb3": "Stable-Baselines3",
+}
+"""Of the learners, in the plot."""
+LEARNERS = tuple(LABELS)
 SOLVED = 0.95
 VERSION, MODULE = "v4", "gymnasium_robotics"
 
@@ -258,23 +267,25 @@ def table(rows: Sequence[Row]) -> str:
 
 def plot(rows: Sequence[Row], path: Path) -> None:
     """Success of each run against steps and against minutes, a row of axes for each task."""
-    by_task = {task: {key: cells for key, cells in groups(rows).items() if key[0] == task} for task in dict.fromkeys(key[0] for key in groups(rows))}
-    colour_of = dict(zip(LEARNERS, colours("viridis", len(LEARNERS), end=0.9), strict=True))
-    for task, found in by_task.items():
-        with figure(path.with_stem(f"{path.stem}_{task}"), columns=2, figsize=(10, 4), sharey=True) as (_, axes):
-            for (_, learner, num_demos), cells in found.items():
-                for index, row in enumerate(cells):
-                    points = [{"steps": 0, "seconds": 0.0, "held": 0.0}, *row["points"]]
-                    label = f"{learner}, {num_demos} demonstrations" if index == 0 else None
-                    for axis, name, scale in zip(axes, ("steps", "seconds"), (1, 1 / 60), strict=True):
-                        x, y = [scale * point[name] for point in points], [100 * point["held"] for point in points]
-                        axis.plot(x, y, color=colour_of[learner], linewidth=1, label=label)
-            for axis, label in zip(axes, ("environment steps", "minutes"), strict=True):
-                axis.set(xlabel=label)
-                mark_success(axis)
-            axes[0].xaxis.set_major_formatter("{x:,.0f}")
-            axes[0].set_title(f"{task}, each line a seed", loc="left")
-            legend_beside(axes[1])
+    tasks = list(dict.fromkeys(task for task, _, _ in groups(rows)))
+    colour_of = dict(zip(LABELS, colours("viridis", len(LABELS), end=0.9), strict=True))
+    with figure(path, len(tasks), 2, figsize=(11, 2.6 * len(tasks)), sharey=True) as (_, axes):
+        for (task, learner, num_demos), cells in groups(rows).items():
+            beside = axes[2 * tasks.index(task) :][:2]
+            for index, row in enumerate(cells):
+                points = [{"steps": 0, "seconds": 0.0, "held": 0.0}, *row["points"]]
+                label = f"{LABELS[learner]}, {num_demos or 'no'} demonstrations" if index == 0 else None
+                for axis, name, scale in zip(beside, ("steps", "seconds"), (1, 1 / 60), strict=True):
+                    x, y = [scale * point[name] for point in points], [100 * point["held"] for point in points]
+                    axis.plot(x, y, color=colour_of[learner], linewidth=1.5, label=label)
+        for task, left, right in zip(tasks, axes[::2], axes[1::2], strict=True):
+            mark_success(left)
+            mark_success(right)
+            left.set(xlabel="environment steps")
+            right.set(xlabel="minutes", ylabel="")
+            left.xaxis.set_major_formatter("{x:,.0f}")
+            left.set_title(f"{task}, each line a seed", loc="left")
+            legend_beside(right)
 
 
 if __name__ == "__main__":
