@@ -1,4 +1,4 @@
-"""Success against environment steps and against minutes on other people's tasks: ours, and Stable-Baselines3's TQC with hindsight.
+"""Success against environment steps and against minutes on other people's tasks: ours, and TQC with hindsight of Stable-Baselines3 and SBX.
 
 python -m benchmarks.time_to_solve                                   # the four Fetch tasks, 3 seeds, at most 15 minutes each: hours
 python -m benchmarks.time_to_solve --tasks FetchPush --learners hindrl sb3-demos --seeds 2 --minutes 5

@@ -1,5 +1,5 @@
 """Draws the pictures of README and of the pages: docs/how_it_works.png, environments.png, epsilon_filter.png, cable_expert.png, values.png and, of
-the runs that are there, docs/panda.gif, docs/grid.gif, docs/fetch.gif and docs/grid_curve.png. docs/gallery.md shows them together.
+the runs that are there, docs/panda.gif, docs/grid.gif, docs/fetch.gif and docs/grid_curve.png. docs/gallery.md shows most of them together.
 
     hindrl train --env FixedGridPickAndPlace --demos 1 --seed 2 --stop-at 0.98 --out runs/quickstart
     hindrl train --env FixedParameterizedReach --demos 1 --seed 0 --stop-at 0.98 --out runs/reach

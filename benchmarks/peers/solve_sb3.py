@@ -1,11 +1,11 @@
-"""TQC with hindsight experience replay of Stable-Baselines3, for `time_to_solve`: prints a line of JSON after every evaluation.
+"""TQC with hindsight experience replay of Stable-Baselines3 or SBX, for `time_to_solve`: prints a line of JSON after every evaluation.
 
     python solve_sb3.py --env FetchPush-v4 --seed 0 --steps 100000 --every 10000 --episodes 50 --module gymnasium_robotics
 
-The settings are those of the RL Zoo (hyperparams/tqc.yml), made for a million steps on a GPU. With `--library sbx` it is SBX, the same authors' TQC
-in JAX, with what fits minutes on a CPU: two layers of 256 and batches of 256, the rest as in the Zoo. With `--demos FILE` the demonstrations of
-an npz file (`time_to_solve.save_episodes`) are in its replay buffer from the beginning. Seconds count from the start of the program, without
-evaluations. It takes all cores that it may use.
+The settings are those of the RL Zoo (hyperparams/tqc.yml), but for FetchReach made for a million steps and more on a GPU. With `--library sbx` it is
+SBX, the same authors' TQC in JAX, with what fits minutes on a CPU: two critics, two layers of 256 and batches of 256, the rest as in the Zoo.
+With `--demos FILE` the demonstrations of an npz file (`time_to_solve.save_episodes`) are in its replay buffer from the beginning. Seconds count from
+the start of the program, without evaluations. It takes all cores that it may use.
 """
 
 import importlib

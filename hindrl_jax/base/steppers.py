@@ -7,7 +7,7 @@ from typing import Any, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 
-from hindrl_jax.base.environments import Environment
+from hindrl_jax.base.environments import Environment, can_step
 from hindrl_jax.base.errors import UserError
 
 
@@ -96,6 +96,11 @@ class Watchable(HostStepped, Protocol):
 def can_step_on_host(env: Any) -> TypeGuard[HostStepped]:
     """Whether the environment can be stepped outside JAX, many at once, with the back end that it has now."""
     return isinstance(env, HostStepped) and getattr(env, "steps_on_host", True)
+
+
+def can_be_watched(env: Any) -> TypeGuard[Watchable]:
+    """Whether the environment, stepped outside JAX, shows its raw observations and draws itself."""
+    return isinstance(env, Watchable) and not can_step(env)
 
 
 def gives_goals(env: Any) -> bool:

@@ -11,9 +11,10 @@ from hindrl_jax.config.batch import BatchConfig
 from hindrl_jax.config.goal import GoalConfig
 from hindrl_jax.config.quirks import QuirksConfig
 
-STEPS_PER_UPDATE, STEPS_PER_UPDATE_OWN_GOALS = 4, 2
-"""Control steps for each gradient step, where the config does not say how many of these there are: in general, and where episodes have goals of their
-own, since hindsight makes more rows of each step there."""
+STEPS_PER_UPDATE = 4
+"""Control steps for each gradient step, where the config does not say how many of these there are."""
+STEPS_PER_UPDATE_OWN_GOALS = 2
+"""The same where episodes have goals of their own, so that four fifths of the replay rows are relabelled (docs/recipe.md has the measurement)."""
 FEWEST_STEPS, DECISIONS = 100_000, 50_000
 """Environment steps of a run, where the config does not say how many: at least so many, and enough for so many decisions."""
 Algorithm = Literal["bc", "tqcfd", "hindrl", "smooth-hindrl"]

@@ -10,7 +10,7 @@ from hindrl_jax.config import AgentConfig, TrainConfig
 
 _LEAST_EXTENT = 1e-6
 _LEAST_DEVIATION = 0.1  # of the root mean square
-_MOST_DEVIATIONS = 100.0  # a block that the demonstrations never turn, and a rollout does, would else be at a million
+_MOST_DEVIATIONS = 100.0  # what is almost constant in the demonstrations would else be an input of 1e5 and more once it moves
 
 
 class InputScale(struct.PyTreeNode, kw_only=True):

@@ -19,7 +19,7 @@ from hindrl_jax.base.compilation import in_float32
 from hindrl_jax.base.environments import Environment, Restorable
 from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.base.files import DAMAGED_ARCHIVE, check_can_write, disk_trouble, read_arrays, write_atomically
-from hindrl_jax.base.steppers import Watchable
+from hindrl_jax.base.steppers import can_be_watched
 from hindrl_jax.base.types import Episodes
 from hindrl_jax.core.agent import Params, Policy, init, policy
 from hindrl_jax.core.goals import GoalTable
@@ -170,7 +170,7 @@ class Run:
         check_film(path, len(keys))
         index = self._index_of(seed)
         trained = self._trained(noise)
-        if isinstance(env, Watchable):
+        if can_be_watched(env):
             pictures, num_solved = trained.film(keys, index)
             with disk_trouble(path):
                 save_pictures(pictures, [1.0 / env.render_fps] * len(pictures), path)
@@ -193,7 +193,8 @@ class Run:
           noise: of the actions, 0 for the mean ones, 1 for sampled ones; None for what the run has found to be best.
 
         Returns:
-          A table of N episodes with their states, repeated after the end. Environments of Gymnasium have no states, and zeros after the end.
+          A table of N episodes. Where JAX steps the environment, with their states; rows after the end repeat the last one, and `desired_goals` are
+          what was achieved at the end. Of Gymnasium's environments without states; rows after the end are 0, and `desired_goals` were aimed at.
 
         Raises:
           UserError: if the run has no such seed.

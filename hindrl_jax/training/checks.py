@@ -120,11 +120,11 @@ def check_config(env: Environment, config: TrainConfig) -> None:
     name, goal = env.name, config.goal
     in_jax = can_step(env)
     own_goals = not in_jax and gives_goals(env)
-    if own_goals and goal.behavioural_goals != "environment":
+    if own_goals and not config.own_goals:
         raise UserError(
             f"behavioural_goals = {goal.behavioural_goals} cannot be had in {name}, whose episodes come with goals of their own: choose environment"
         )
-    if not own_goals and goal.behavioural_goals == "environment":
+    if config.own_goals and not own_goals:
         raise UserError(f"behavioural_goals = environment cannot be had in {name}, which gives its episodes no goals: choose another")
     if isinstance(env, RelabelsObservations):
         if config.batch.uses_intersections:

@@ -1,4 +1,4 @@
-"""Playing with policies in environments that are stepped outside JAX: evaluations and films."""
+"""Playing with policies in environments that are stepped outside JAX, and what was played as a table of episodes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from hindrl_jax.base.environments import Environment, action_from_env, action_to_env
-from hindrl_jax.base.steppers import HostStepped, Outcome, Stepper, WatchedStepper
+from hindrl_jax.base.steppers import HostStepped, Outcome, Stepper
 from hindrl_jax.base.types import Array, Episodes
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.core.agent import Policy
@@ -125,41 +125,10 @@ def play(stepper: Stepper, seeds: np.ndarray, act: HostAct, num_episodes: int) -
     return success, length
 
 
-def play_one(
-    env: Environment,
-    stepper: WatchedStepper,
-    seed: int,
-    act: HostAct,
-    behavioural_goal: np.ndarray,
-    num_held: int = 1,
-    look: Callable[[], None] = lambda: None,
-) -> Episodes:
-    """Plays one episode, solved or not: a table of one, without states.
-
-    Args:
-      env: the task.
-      stepper: one environment of it.
-      seed: which episode.
-      act: the policy.
-      behavioural_goal: (1, G), in the place of a goal of the episode's own where it has none.
-      num_held: steps for which each action is held.
-      look: called at the beginning and after every step.
-    """
-    observation, own_goal = stepper.begin(np.array([seed]))
-    goal = behavioural_goal if own_goal is None else own_goal
-    observations, actions, solved, ended = [observation], [], [], False
-    look()
-    while not ended:
-        if len(actions) % num_held == 0:
-            action = act(observations[-1], goal)
-        outcome = stepper.step(action, autoreset=False)
-        look()
-        observations.append(outcome.next_observation)
-        actions.append(action)
-        solved.append(outcome.success[0])
-        ended = outcome.ended[0]
-    episode = as_episode(env, np.concatenate(observations), np.concatenate(actions), np.array(solved), goal[0])
-    return jax.tree.map(lambda leaf: leaf[None], episode)
+def played_action(env: Environment, action: np.ndarray) -> np.ndarray:
+    """What an environment makes of an action (..., A): bounded, and whole where it takes whole numbers."""
+    own = getattr(env, "played_action", None)
+    return np.clip(action, env.action_low, env.action_high) if own is None else own(action)
 
 
 def as_episode(env: Environment, observations: np.ndarray, actions: np.ndarray, solved: np.ndarray, goal: np.ndarray) -> Episodes:

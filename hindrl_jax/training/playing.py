@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -22,7 +23,7 @@ from hindrl_jax.base.environments import (
     compiler_options,
 )
 from hindrl_jax.base.errors import UserError
-from hindrl_jax.base.steppers import HostStepped, Watchable, can_step_on_host
+from hindrl_jax.base.steppers import HostStepped, Watchable, WatchedStepper, can_be_watched, can_step_on_host
 from hindrl_jax.base.types import Array, Episodes, tree_where
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.core import rollout
@@ -153,8 +154,9 @@ class TrainedPolicies:
     def player(self, index: int, num_episodes: int) -> Callable[[Array], Episodes]:
         """`player` of one policy. Each episode aims at a behavioural goal that is drawn for it."""
         env = self._decisions
-        if isinstance(self.env, Watchable) and not can_step(env):
-            return lambda key: self._play_on_host(jax.random.split(key, num_episodes), index)
+        if can_be_watched(self.env):
+            watched: Watchable = self.env
+            return lambda key: self._play_on_host(watched, jax.random.split(key, num_episodes), index)[0]
         policy, goals = jax.tree.map(lambda leaf: leaf[index], (self.policies, self.behavioural_goals))
         choose = make_policy(policy, env, self.config)
 
@@ -175,27 +177,48 @@ class TrainedPolicies:
         Raises:
           UserError: if the environment draws no pictures.
         """
-        if not isinstance(self.env, Watchable):
+        if not can_be_watched(self.env):
             raise UserError(f"{self.env.name} does not draw itself: play it, and draw the states")
-        pictures: list[np.ndarray] = []
-        episodes = self._play_on_host(keys, index, pictures)
+        of_one = jnp.concatenate([jax.random.split(key, 1) for key in keys])  # as `play` has it, so that a film is of the episode that is played
+        episodes, pictures = self._play_on_host(self.env, of_one, index, with_pictures=True)
         return pictures, int(episodes.terminated.sum())
 
-    def _play_on_host(self, keys: Array, index: int, pictures: list[np.ndarray] | None = None) -> Episodes:
-        """An episode for each of the keys (N,) with one policy, in an environment that is stepped outside JAX; pictures are added to those given."""
-        env: Any = self.env
+    def _play_on_host(self, env: Watchable, keys: Array, index: int, *, with_pictures: bool = False) -> tuple[Episodes, list[np.ndarray]]:
+        """An episode for each of the keys (N,) with one policy, outside JAX, and pictures of all their states."""
         policy = jax.tree.map(lambda leaf: leaf[index : index + 1], self.policies)
         goals = jax.tree.map(lambda leaf: leaf[index], self.behavioural_goals)
         policies = host_playing.HostPolicies(env, self.config, seed_mesh(1))
-        episodes = []
+        played = []
         for key in keys:
             key_seed, key_act = jax.random.split(key)
             act = policies.acting(key_act[None], policy)
             goal = np.asarray(sample_goals(jax.random.fold_in(key_act, 0), goals, 1))
-            with contextlib.closing(env.watched(with_pictures=pictures is not None)) as stepper:
-                look = (lambda: None) if pictures is None else (lambda stepper=stepper: pictures.append(stepper.picture()))
-                episodes.append(host_playing.play_one(env, stepper, int(jax.random.bits(key_seed)), act, goal, self.num_held, look))
-        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *episodes)
+            with contextlib.closing(env.watched(with_pictures=with_pictures)) as stepper:
+                played.append(self._play_one(stepper, int(jax.random.bits(key_seed)), act, goal, with_pictures=with_pictures))
+        episodes, pictures = zip(*played, strict=True)
+        return jax.tree.map(lambda *leaves: np.stack(leaves), *episodes), list(itertools.chain(*pictures))
+
+    def _play_one(
+        self, stepper: WatchedStepper, seed: int, act: host_playing.HostAct, behavioural_goal: np.ndarray, *, with_pictures: bool
+    ) -> tuple[Episodes, list[np.ndarray]]:
+        """One episode, and pictures of its states; the behavioural goal (1, G) is for environments that give none."""
+        observation, own_goal = stepper.begin(np.array([seed]))
+        goal = behavioural_goal if own_goal is None else own_goal
+        observations, solved, ended = [observation], [], False
+        actions: list[np.ndarray] = []
+        pictures = [stepper.picture()] if with_pictures else []
+        while not ended:
+            if len(actions) % self.num_held == 0:
+                action = act(observations[-1], goal)
+            outcome = stepper.step(action, autoreset=False)
+            if with_pictures:
+                pictures.append(stepper.picture())
+            observations.append(outcome.next_observation)
+            actions.append(host_playing.played_action(self.env, action))
+            solved.append(outcome.success[0])
+            ended = outcome.ended[0]
+        episode = host_playing.as_episode(self.env, np.concatenate(observations), np.concatenate(actions), np.array(solved), goal[0])
+        return episode, pictures
 
     def _evaluate_in_jax(self, env: Steppable, keys: Array, num_episodes: int) -> Evaluation:
         """All episodes of all policies in one compiled program."""

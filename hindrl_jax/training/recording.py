@@ -12,14 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from hindrl_jax.base.compilation import in_float32
-from hindrl_jax.base.environments import Environment, can_step, state_dim
+from hindrl_jax.base.environments import Environment, state_dim
 from hindrl_jax.base.errors import UserError
-from hindrl_jax.base.steppers import Watchable
+from hindrl_jax.base.steppers import Watchable, can_be_watched
 from hindrl_jax.base.types import Array, Episodes
 from hindrl_jax.tasks.registry import task
 from hindrl_jax.training.checks import check_demonstrations, check_dimensions, check_expert
 from hindrl_jax.training.devices import free_memory, seed_mesh
-from hindrl_jax.training.host_playing import as_episode
+from hindrl_jax.training.host_playing import as_episode, played_action
 from hindrl_jax.training.playing import player, plays_one_by_one
 
 Expert = Any
@@ -46,7 +46,7 @@ def record_demonstrations(env: Environment, num_demos: int, *, seed: int = 0, ex
         if expert_class is None:
             raise UserError(f"no expert is known for {env.name}: give one, or demonstrations from a file, which hindrl_jax.record_gymnasium can make")
         expert = expert_class()
-    if not can_step(env) and isinstance(env, Watchable):
+    if can_be_watched(env):
         policy = expert.acting_in(env) if hasattr(expert, "acting_in") else expert.act
         return record_gymnasium(env, policy, num_demos, seed=seed)
     return record(jax.random.fold_in(jax.random.key(seed), 1), env, expert, num_demos)
@@ -119,14 +119,13 @@ def record_gymnasium(env: Watchable, policy: Demonstrator, num_demos: int, *, se
     max_attempts = 100 * num_demos if max_attempts is None else max_attempts
     rng = np.random.default_rng(seed)
     kept: list[Episodes] = []
-    played_action = getattr(env, "played_action", lambda action: np.clip(action, env.action_low, env.action_high))
     with contextlib.closing(env.watched(with_pictures=False)) as stepper:
         observation, goal = stepper.begin(rng.integers(2**32, size=1))
         for _ in range(max_attempts):
             observations, actions, solved, ended = [observation], [], [], False
             while not ended:
                 action = _checked(policy(stepper.raw_observation(), rng), env)
-                actions.append(played_action(action))
+                actions.append(played_action(env, action))
                 outcome = stepper.step(action[None])
                 observations.append(outcome.next_observation)
                 solved.append(outcome.success[0])

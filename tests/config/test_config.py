@@ -246,3 +246,11 @@ def test_fields_without_effect_are_known(changes, name, reason):
     values = {key: dataclasses.replace(getattr(TrainConfig(), key), **value) if key in SECTIONS else value for key, value in changes.items()}
     said = without_effect(TrainConfig(**values), name)
     assert said is None if reason is None else reason in said
+
+
+@pytest.mark.parametrize(("hold", "own_goals", "updates"), [(1, False, 2), (1, True, 4), (4, False, 8), (4, True, 16), (None, False, 2)])
+def test_gradient_steps_follow_from_environment_steps(hold, own_goals, updates):
+    """8 environments take 8 steps, or 32 where actions are held for 4: a gradient step for every 4 of them, or 2."""
+    goal = GoalConfig(behavioural_goals="environment" if own_goals else "task")
+    assert TrainConfig(num_envs=8, action_hold=hold, goal=goal).num_updates == updates
+    assert TrainConfig(num_envs=8, action_hold=hold, goal=goal, updates_per_iteration=3).num_updates == 3

@@ -2,20 +2,24 @@
 
 import dataclasses
 
+import flat_env
 import jax
 import numpy as np
 import point_env
 import pytest
+from flat_env import to_corner
 from host_env import HostCorridor
 from point_env import to_goal
 from tiny import CONFIG, ENV
 from toy_env import Corridor, corridor_demonstrations
 
 import hindrl_jax as hindrl
+from hindrl_jax.config import GoalConfig
 from hindrl_jax.core import train
 from hindrl_jax.core.guidance import guidance
 from hindrl_jax.core.holding import hold, hold_demonstrations
 from hindrl_jax.tasks.registry import TASKS
+from hindrl_jax.training import host_playing
 from hindrl_jax.training.playing import TrainedPolicies, player
 
 
@@ -120,8 +124,28 @@ def test_episodes_outside_jax_are_what_the_policy_did_there(num_held):
         assert episodes.terminated[episode] == reached[-1]
         assert length == 7 or reached[-1]
     assert len(np.unique(episodes.desired_goals, axis=0)) == 4
-    pictures, num_solved = policies.film(jax.random.split(jax.random.key(3), 4), 1)
-    assert (len(pictures), num_solved) == (episodes.lengths.sum() + 4, episodes.terminated.sum())
+    of_one = policies.play(jax.random.key(9), 1, 1)
+    pictures, num_solved = policies.film(jax.random.key(9)[None], 1)
+    assert (len(pictures), num_solved) == (of_one.lengths[0] + 1, of_one.terminated[0])
+
+
+def test_episodes_without_goals_of_their_own_are_played_towards_behavioural_ones():
+    env = hindrl.make("gymnasium:flat_env:PointFlat-v0", horizon=4, make_kwargs=("near=1.5",))
+    recorded = hindrl.record_gymnasium(env, to_corner, 2)
+    policies = trained(env, jax.tree.map(jax.numpy.asarray, recorded), flat_env.CONFIG, goal=GoalConfig(behavioural_goals="task"))
+    episodes = policies.play(jax.random.key(3), 0, 3)
+    np.testing.assert_allclose(episodes.desired_goals, np.tile(policies.behavioural_goals.goals[0, 0], (3, 1)), rtol=1e-6)
+    np.testing.assert_allclose(episodes.observations[:, 1, 2:], flat_env.SPEED * episodes.actions[:, 0], atol=1e-5)
+
+
+def test_actions_are_noted_as_they_were_played():
+    """Bounded whole numbers are rounded on their way to the environment."""
+    env = hindrl.make("gymnasium:odd_env:Odd-v0", make_kwargs=("action=int8",))
+    whole = host_playing.played_action(env, np.array([[0.3, -0.2], [90.0, -90.0]], np.float32))
+    np.testing.assert_array_equal(whole, np.rint(whole))
+    assert np.all((whole >= np.ceil(env.action_low)) & (whole <= np.floor(env.action_high)))
+    bounded = host_playing.played_action(HostCorridor(), np.full((1, HostCorridor().action_dim), 7.0))
+    np.testing.assert_array_equal(bounded[0], HostCorridor().action_high)
 
 
 def test_only_what_draws_itself_is_filmed():
