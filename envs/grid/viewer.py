@@ -79,8 +79,9 @@ def frame(env: GridTask, state: GridState, *, caption: str = "") -> np.ndarray:
     for i in range(num_delivered):  # on top, in rows of three along the upper edge of the goal cell
         canvas.tick(objects[i], 0.15, _DELIVERED, shift=(-0.32 + 0.32 * (i % 3), -0.32 + 0.32 * (i // 3)))
 
-    progress = f"step {int(state.step)}    delivered {num_delivered}/{env.num_objects}"
-    strip = drawing.caption_strip(width, caption or env.name, progress, solved=bool(env.is_solved(state)))
+    solved = bool(env.is_solved(state))  # with the last object still in the hand
+    progress = f"step {int(state.step)}    delivered {env.num_objects if solved else num_delivered}/{env.num_objects}"
+    strip = drawing.caption_strip(width, caption or env.name, progress, solved=solved)
     return np.concatenate([canvas.pixels(), strip])
 
 
