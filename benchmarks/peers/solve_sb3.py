@@ -21,6 +21,7 @@ from stable_baselines3 import HerReplayBuffer  # noqa: E402
 from stable_baselines3.common.callbacks import BaseCallback  # noqa: E402
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize  # noqa: E402
 
+GAMMA = 0.95
 REACH = dict(ent_coef="auto", batch_size=256, learning_starts=1_000, policy_kwargs={"net_arch": [64, 64], "n_critics": 1})
 OTHERS = dict(tau=0.05, batch_size=2048, policy_kwargs={"net_arch": [512, 512, 512], "n_critics": 2})
 ON_A_CPU = dict(batch_size=256, policy_kwargs={"net_arch": [256, 256], "n_critics": 2})
@@ -74,14 +75,14 @@ def main() -> None:
     importlib.import_module(arguments.module)
     env = DummyVecEnv([lambda: gymnasium.make(arguments.env)])
     if arguments.env.startswith("FetchReach"):
-        env = VecNormalize(env, gamma=0.95)
+        env = VecNormalize(env, gamma=GAMMA)
     model = importlib.import_module(arguments.library).TQC(
         "MultiInputPolicy",
         env,
         replay_buffer_class=HerReplayBuffer,
         replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"},
         buffer_size=1_000_000,
-        gamma=0.95,
+        gamma=GAMMA,
         learning_rate=1e-3,
         seed=arguments.seed,
         device="cpu",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import itertools
 from collections.abc import Callable
 from typing import Any
@@ -183,15 +184,19 @@ class TrainedPolicies:
         episodes, pictures = self._play_on_host(self.env, of_one, index, with_pictures=True)
         return pictures, int(episodes.terminated.sum())
 
+    @functools.cached_property
+    def _one_on_host(self) -> host_playing.HostPolicies:
+        """What acts for any one of the policies outside JAX, compiled once."""
+        return host_playing.HostPolicies(self.env, self.config, seed_mesh(1))
+
     def _play_on_host(self, env: Watchable, keys: Array, index: int, *, with_pictures: bool = False) -> tuple[Episodes, list[np.ndarray]]:
         """An episode for each of the keys (N,) with one policy, outside JAX, and pictures of all their states."""
         policy = jax.tree.map(lambda leaf: leaf[index : index + 1], self.policies)
         goals = jax.tree.map(lambda leaf: leaf[index], self.behavioural_goals)
-        policies = host_playing.HostPolicies(env, self.config, seed_mesh(1))
         played = []
         for key in keys:
             key_seed, key_act = jax.random.split(key)
-            act = policies.acting(key_act[None], policy)
+            act = self._one_on_host.acting(key_act[None], policy)
             goal = np.asarray(sample_goals(jax.random.fold_in(key_act, 0), goals, 1))
             with contextlib.closing(env.watched(with_pictures=with_pictures)) as stepper:
                 played.append(self._play_one(stepper, int(jax.random.bits(key_seed)), act, goal, with_pictures=with_pictures))

@@ -18,5 +18,5 @@ def test_the_command_solves_the_fixed_grid(tmp_path):
     assert outcome.returncode == 0, outcome.stderr
     (seed,) = json.loads((tmp_path / "run" / "summary.json").read_text())["seeds"]
     assert seed["returned_success"] >= 0.9, outcome.stdout  # in other episodes than those that confirmed it
-    assert seed["returned_length"] < 54.5, outcome.stdout  # the expert's; the best possible is 41.5
+    assert seed["returned_length"] <= 50, outcome.stdout  # the best possible is 41.5, the expert's 54.5
     assert seed["returned_env_steps"] < 32_000, outcome.stdout
