@@ -21,7 +21,7 @@ from hindrl_jax.tasks.functions import find_function, function_name
 from hindrl_jax.tasks.registry import TASKS, did_you_mean, make
 
 _TYRO = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
-ENV_HELP = "The environment; `hindrl envs` lists them. One of Gymnasium is gymnasium:ID, as in gymnasium:FetchReach-v4."
+ENV_HELP = "The environment; `hindrl envs` lists them. One of Gymnasium is gymnasium:ID, as in gymnasium:FetchReach-v4, one of your own MODULE:NAME."
 Brief = tuple[Mapping[str, Mapping[str, str]], Sequence[str]]  # as `short_page` takes them
 _PLAIN: dict[str, Any] = dict(highlight=False, soft_wrap=True, markup=False, emoji=False)
 console = Console(**_PLAIN)

@@ -27,7 +27,7 @@ def show(arguments: list[str]) -> None:
             console.print(f"  --{field.name.replace('_', '-')} (default {field.default})")
     console.print(
         "gymnasium:ID: an environment of Gymnasium, with goals or with flat observations and a sparse reward, as in gymnasium:FetchReach-v4 "
-        "(from pip install gymnasium-robotics); gymnasium:MODULE:ID is registered by MODULE"
+        "(from the extra gymnasium-robotics); gymnasium:MODULE:ID is registered by MODULE"
     )
     for field in dataclasses.fields(GymnasiumEnv):
         console.print(f"  --{field.name.replace('_', '-')} (default {field.default})")

@@ -189,7 +189,8 @@ def short_page(program: str, description: str, groups: Sequence[Group], chosen: 
     for title, texts in chosen.items():
         lines += ["", f"{title}:"]
         for head, text in texts.items():
-            lines += _beside(f"  --{head}", f"{text} {flags[head.partition(' ')[0]].default}")
+            default = flags[head.partition(" ")[0]].default  # of this task and algorithm, where it is known
+            lines += _beside(f"  --{head}", f"{text.partition(' (default')[0]} {default}" if default else text)
     task = next((group for group in groups if group.title == "environment"), None)
     if task is not None:
         lines += ["", "of this task:", *_wrapped(", ".join(f"--{flag.name}" for flag in task.flags), 2)]

@@ -45,7 +45,7 @@ class Ablation:
     seed: int = 2_000
     """The first seed; the others follow it."""
     steps: int | None = None
-    """Environment steps of each run (default: the recipe's until its agent is reset)."""
+    """Environment steps of each run (default: the recipe's own)."""
     overwrite: bool = False
     """Replace runs that were made with other options. To train one again with the same options, remove its directory."""
     list: bool = False

@@ -132,8 +132,6 @@ def run(
                 steps = int(np.median([table.lengths for table in demonstrations]))
                 what = f"a decision is {num_held} actions" if result.config.action_chunks else f"each action is held for {num_held} steps"
                 progress.say(f"{what}, so a demonstration of {steps} steps takes {-(-steps // num_held)} decisions")
-            for share in spec.config.agent_resets:
-                progress.say(f"the agent is reset at step {share * spec.config.num_steps:,.0f}, so success will drop there and come back")
             if resumes:
                 progress.say(f"going on at step {result.steps_done:,}" if result.steps_done else "there is no checkpoint yet: beginning again")
             stop_signals.note()

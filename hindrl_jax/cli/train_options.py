@@ -27,7 +27,7 @@ _BRIEF = {  # what --help shows
         "demos N|FILE": "how many demonstrations the task's expert records for each seed, or a file of them",
         "algo NAME": "bc, tqcfd, hindrl or smooth-hindrl",
         "preset NAME": "where the other defaults come from: default, thesis, original or rlpd",
-        "steps N": "environment steps of each seed (default: 50,000 decisions, at least 100,000 steps)",
+        "steps N": "environment steps of each seed; for bc, which takes none, gradient steps (default: 50,000 decisions, at least 100,000 steps)",
         "stop-at SHARE": "stop when this share of episodes is solved, for example 0.95",
     },
     "the run": {

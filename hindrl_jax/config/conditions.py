@@ -11,10 +11,6 @@ def _relabels(config: TrainConfig) -> bool:
     return config.learns_from_rollouts and config.batch.relabelled_per_original > 0
 
 
-def _tests_goals(config: TrainConfig) -> bool:
-    return _relabels(config) or (config.learns_from_rollouts and config.goal.has_achieved_goals)
-
-
 def _relabels_with_demonstrations(config: TrainConfig) -> bool:
     return _relabels(config) and not {"task_conditioned", "joint_intersection"}.isdisjoint(dict(config.batch.sources))
 
@@ -24,7 +20,7 @@ def _has_demo_rows(config: TrainConfig) -> bool:
 
 
 def _clones(config: TrainConfig) -> bool:
-    """Whether cloning is ever part of the loss; a `bc_warm_start` clones by itself."""
+    """Whether cloning is ever part of the loss; an `imitation_proposal` clones by itself."""
     return not config.learns_from_rollouts or config.agent.bc_weight > 0.0
 
 
@@ -36,8 +32,8 @@ CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
     (
         "max_demo_ratio reach_zero relabelled_per_original hindrl_sampling_strategy union_sampling_ratio intersection_goals "
         "n_step gamma bootstrap_past_relabelled_goals timeouts_are_terminal "
-        "achieved_goal_ratio clip_targets num_critics num_target_critics num_quantiles top_quantiles_to_drop_per_net "
-        "layer_norm target_update_rate initial_alpha relative_value target_entropy final_target_entropy bc_weight agent_resets num_envs "
+        "clip_targets num_critics num_target_critics num_quantiles top_quantiles_to_drop_per_net "
+        "layer_norm target_update_rate initial_alpha relative_value target_entropy final_target_entropy bc_weight num_envs "
         "updates_per_iteration learning_starts buffer_size demo_reset_ratio demo_reset_curriculum critic_network actor_loss critic_loss",
         lambda c: c.learns_from_rollouts,
         "behaviour cloning does not use it: choose another algo",
@@ -53,8 +49,8 @@ CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
     ),
     (
         "bootstrap_past_relabelled_goals strict_goal_test",
-        _tests_goals,
-        "no goal is tested: choose --algo hindrl with --relabelled-per-original above 0, or an --achieved-goal-ratio",
+        _relabels,
+        "no goal is tested: choose --algo hindrl with --relabelled-per-original above 0",
     ),
     (
         "union_sampling_ratio",
@@ -75,17 +71,17 @@ CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
     ("bc_weight q_filter", _has_demo_rows, "the batch has no demonstration rows to clone: raise --max-demo-ratio"),
     (
         "bc_loss bc_action unscaled_demo_actions",
-        lambda c: _has_demo_rows(c) or c.clones_first,
+        lambda c: _has_demo_rows(c) or c.imitation_proposal > 0,
         "the batch has no demonstration rows to clone: raise --max-demo-ratio",
     ),
     ("q_filter", _clones, "nothing is cloned: raise --bc-weight"),
-    ("bc_loss bc_action", lambda c: _clones(c) or c.clones_first, "nothing is cloned: raise --bc-weight"),
+    ("bc_loss bc_action", lambda c: _clones(c) or c.imitation_proposal > 0, "nothing is cloned: raise --bc-weight"),
     ("epsilon_steps epsilon_deviations", lambda c: c.goal.epsilon is None, "epsilon itself is given: set it to None (--epsilon None)"),
     ("epsilon_deviations", lambda c: c.goal.epsilon_steps > 0, "epsilon depends on it only where pairs are some steps apart: add --epsilon-steps 5"),
     (
         "epsilon_steps epsilon_deviations epsilon",
-        _tests_goals,
-        "epsilon is used only for relabelling, achieved goals and the filter: choose --algo hindrl",
+        _relabels,
+        "epsilon is used only for relabelling and the filter: choose --algo hindrl",
     ),
 )
 """The fields, the condition under which they have an effect, and what to do where it does not hold."""

@@ -23,9 +23,6 @@ class GoalConfig:
     behavioural_goals: Literal["final_demonstration_states", "task", "environment"] = "final_demonstration_states"
     """Goal of a rollout: the end of a random demonstration (thesis algorithm 5), the task's one constant goal (original code; where the environment
     knows of none, the mean of these ends), or, where episodes come with goals of their own (Gymnasium's environments), that goal."""
-    achieved_goal_ratio: float = 0.0
-    """Share of training episodes with another behavioural goal: a state reached earlier in training, whatever the task (thesis chapter 6). They
-    are rewarded, when drawn, for reaching that goal. Evaluations never have one."""
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -34,14 +31,8 @@ class GoalConfig:
             epsilon_steps=(self.epsilon_steps >= 0, "0 or more"),
             epsilon_deviations=(self.epsilon_deviations >= 0.0, "0 or more"),
             epsilon=(self.epsilon is None or self.epsilon >= 0.0, "0 or more, or None"),
-            achieved_goal_ratio=(0.0 <= self.achieved_goal_ratio <= 1.0, "between 0 and 1"),
         )
         if self.epsilon is not None and self.epsilon_steps > 1:
             raise ValueError(
                 f"epsilon_steps = {self.epsilon_steps} is of no use while epsilon = {self.epsilon} is given: set one to 1 or the other to None"
             )
-
-    @property
-    def has_achieved_goals(self) -> bool:
-        """Whether some training episodes have a behavioural goal that was achieved earlier."""
-        return self.achieved_goal_ratio > 0.0

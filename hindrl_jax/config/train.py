@@ -48,14 +48,9 @@ class TrainConfig:
     demo_reset_curriculum: bool = False
     """Those states are near the end of each demonstration at first, and move towards its beginning where episodes succeed from them three times in a
     row: the reverse curriculum of RFCL (Tao et al., 2024)."""
-    bc_warm_start: int = 0
-    """Gradient steps of behaviour cloning alone before the first of reinforcement learning, after the random actions of learning_starts."""
     imitation_proposal: int = 0
     """Gradient steps of behaviour cloning that make a second policy, frozen, which proposes an action beside the actor's: whichever the target
     critics value more is taken, in episodes, evaluations and targets (IBRL, Hu et al., 2024). 0 for no such policy."""
-    agent_resets: tuple[float, ...] = ()
-    """Shares of the run, in order, after which networks, optimisers and their schedules are reset, while the replay stays (Nikishin et al., The
-    primacy bias in deep reinforcement learning, 2022)."""
     buffer_size: int = 500_000
     """Transitions that the replay holds."""
     stop_at: float | None = None
@@ -64,7 +59,7 @@ class TrainConfig:
     eval_every: int = 4_000
     """Environment steps (bc: gradient steps) between evaluations."""
     eval_episodes: int = 100
-    """Episodes of each evaluation, with the policy's mean action."""
+    """Episodes of each evaluation, played once with mean and once with sampled actions."""
     batch: BatchConfig = dataclasses.field(default_factory=BatchConfig)
     goal: GoalConfig = dataclasses.field(default_factory=GoalConfig)
     agent: AgentConfig = dataclasses.field(default_factory=AgentConfig)
@@ -82,12 +77,7 @@ class TrainConfig:
             stop_at=(self.stop_at is None or 0.0 < self.stop_at <= 1.0, "greater than 0 and at most 1, or None"),
             learning_starts=(self.learning_starts >= 0, "0 or more"),
             demo_reset_ratio=(0.0 <= self.demo_reset_ratio <= 1.0, "between 0 and 1"),
-            bc_warm_start=(self.bc_warm_start >= 0, "0 or more"),
             imitation_proposal=(self.imitation_proposal >= 0, "0 or more"),
-            agent_resets=(
-                all(0.0 < share < 1.0 for share in self.agent_resets) and sorted(set(self.agent_resets)) == list(self.agent_resets),
-                "shares between 0 and 1, each larger than the one before",
-            ),
         )
         steps = self.num_steps if self.learns_from_rollouts else 0
         updates = self.num_updates * (steps // self.steps_per_iteration + 1) if self.learns_from_rollouts else self.num_steps
@@ -100,8 +90,11 @@ class TrainConfig:
         if self.action_chunks and self.action_hold == 1:
             raise ValueError("action_chunks = True is of no use while action_hold = 1: raise that, too, or set it to None")
         if self.algo == "bc":
-            given: dict[str, Any] = {"bc_warm_start": self.bc_warm_start, "imitation_proposal": self.imitation_proposal}
-            given |= {"q_filter": self.agent.q_filter != "off" and self.agent.q_filter, "base": self.agent.base != "tqc" and self.agent.base}
+            given: dict[str, Any] = {
+                "imitation_proposal": self.imitation_proposal,
+                "q_filter": self.agent.q_filter != "off" and self.agent.q_filter,
+                "base": self.agent.base != "tqc" and self.agent.base,
+            }
             for name, value in given.items():
                 if value:
                     raise ValueError(f"{name} = {value} has no effect on bc, which is behaviour cloning alone: drop it, or choose another algo")
@@ -142,11 +135,6 @@ class TrainConfig:
     def relative_goals(self) -> bool:
         """Whether networks see what is left to the goal, desired less achieved, in place of the goal: where each episode has one of its own."""
         return self.own_goals and not self.quirks.achieved_goal_input
-
-    @property
-    def clones_first(self) -> bool:
-        """Whether something is cloned before the first gradient step of reinforcement learning: the actor, or what proposes beside it."""
-        return self.bc_warm_start > 0 or self.imitation_proposal > 0
 
     @property
     def learns_from_rollouts(self) -> bool:

@@ -19,12 +19,9 @@ from hindrl_jax.core.goals import GoalTest
 from hindrl_jax.core.guidance import Guidance
 from hindrl_jax.core.hindsight import goal_source
 from hindrl_jax.core.randomness import uniform_index
-from hindrl_jax.core.relabel import num_relabelled, relabel, relabel_observations, reward_by_goal
+from hindrl_jax.core.relabel import num_relabelled, relabel, relabel_observations
 from hindrl_jax.core.replay import ReplayState, sample_episodes, sample_steps
 from hindrl_jax.core.steps import as_occupancy, read_steps, transitions
-
-REWARDED_BY_GOAL = "rewarded_by_goal"
-"""The note of the replay on transitions of episodes that are rewarded for reaching their behavioural goal rather than by the environment."""
 
 
 class Rows(NamedTuple):
@@ -89,8 +86,6 @@ def rows_of_replay(key: Array, replay: ReplayState, rows: Rows, guidance: Guidan
             steps = relabel_observations(key, replay, steps, rows.relabelled, source, env)
         else:
             steps = relabel(key, replay, steps, rows.relabelled, source, test)
-    if REWARDED_BY_GOAL in replay.notes:
-        steps = reward_by_goal(steps, replay.notes[REWARDED_BY_GOAL][rows.row, rows.step] & ~steps.is_relabelled, test)
     if holds_goal(env):
         steps = as_occupancy(steps, config.batch.gamma)
     return transitions(steps, env.achieved_goal, config, is_demonstration=False)

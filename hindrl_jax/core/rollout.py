@@ -26,7 +26,6 @@ class RolloutState(struct.PyTreeNode, kw_only=True):
     env_state: Any  # leaves (E, ...)
     observation: Array  # (E, D)
     desired_goal: Array  # (E, G), the behavioural goals
-    notes: dict[str, Array]  # leaves (E,), what the replay is to note of each transition of the episode, by name; most runs note nothing
     origin: Origin | None = None  # where the episodes began; None where none begins in a demonstrated state
 
 
@@ -79,7 +78,6 @@ def reset(key: Array, env: Steppable, behavioural_goals: GoalTable, num_envs: in
         env_state=env_state,
         observation=observation,
         desired_goal=sample_goals(key_goal, behavioural_goals, num_envs),
-        notes={},
         origin=origin,
     )
 

@@ -13,16 +13,16 @@ import jax.numpy as jnp
 from flax import struct
 
 from hindrl_jax.base.environments import Environment, Steppable
-from hindrl_jax.base.types import Array, TimeStep, Transition, tree_where
+from hindrl_jax.base.types import Array, TimeStep, Transition
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.core import agent as agents
 from hindrl_jax.core import curriculum, replay, rollout
 from hindrl_jax.core.agent import AgentState, Metrics, Policy
-from hindrl_jax.core.batch import REWARDED_BY_GOAL, goal_test, sample_batch, sample_demonstrations
+from hindrl_jax.core.batch import goal_test, sample_batch, sample_demonstrations
 from hindrl_jax.core.curriculum import Curriculum
 from hindrl_jax.core.goals import nearby_goal
 from hindrl_jax.core.guidance import Guidance
-from hindrl_jax.core.hindsight import NEARBY_GOAL, hindsight_steps
+from hindrl_jax.core.hindsight import NEARBY_GOAL
 from hindrl_jax.core.inputs import network_inputs
 from hindrl_jax.core.replay import RecordedStep, ReplayState
 from hindrl_jax.core.rollout import Act, DemoResets, Evaluation, RolloutState
@@ -39,8 +39,6 @@ class TrainState(struct.PyTreeNode, kw_only=True):
     key: Array
     env_steps: Array  # () int32
     updates: Array  # () int32
-    resets: Array  # () int32 times that the agent was reset
-    updates_at_reset: Array  # () int32 updates when it last did, or 0
 
 
 def init(key: Array, guidance: Guidance, env: Environment, config: TrainConfig, *, begun: RolloutState | None = None) -> TrainState:
@@ -58,20 +56,17 @@ def init(key: Array, guidance: Guidance, env: Environment, config: TrainConfig, 
     key_agent, key_rollout, key_train = jax.random.split(key, 3)
     capacity = config.buffer_size if config.learns_from_rollouts else 2 * config.num_envs * env.horizon  # the smallest one
     notes: dict[str, int] = {NEARBY_GOAL: -1} if config.batch.uses_intersections else {}
-    notes |= {REWARDED_BY_GOAL: False} if config.goal.has_achieved_goals else {}
     begins = curriculum.init(guidance.starts.lengths) if config.demo_reset_curriculum else None
     if begun is None:
         begun = _new_episodes(key_rollout, guidance, cast(Steppable, env), config, begins)
     return TrainState(
         agent=agents.init(key_agent, guidance.scale, config, action_dim=env.action_dim),
         replay=replay.init(env, num_envs=config.num_envs, capacity=capacity, notes=notes),
-        rollout=_with_notes(begun, config),
+        rollout=begun,
         curriculum=begins,
         key=key_train,
         env_steps=jnp.zeros((), jnp.int32),
         updates=jnp.zeros((), jnp.int32),
-        resets=jnp.zeros((), jnp.int32),
-        updates_at_reset=jnp.zeros((), jnp.int32),
     )
 
 
@@ -82,49 +77,10 @@ def _new_episodes(key: Array, guidance: Guidance, env: Steppable, config: TrainC
     return rollout.reset(key, env, guidance.behavioural_goals, config.num_envs, demo_resets)
 
 
-def _with_notes(episodes: RolloutState, config: TrainConfig) -> RolloutState:
-    """New episodes, which are rewarded by the environment, with what is noted of them."""
-    return episodes.replace(notes={REWARDED_BY_GOAL: jnp.zeros(config.num_envs, bool)} if config.goal.has_achieved_goals else {})
-
-
-def _with_achieved_goals(key: Array, episodes: RolloutState, state: TrainState, env: Environment, config: TrainConfig) -> RolloutState:
-    """New episodes, a share of which are given a goal from the replay and are judged by it; none before the replay holds an episode."""
-    key_choice, key_row, key_step = jax.random.split(key, 3)
-    past, num_envs = state.replay, config.num_envs
-    rows = replay.sample_episodes(key_row, past, num_envs)
-    steps = hindsight_steps(key_step, jnp.zeros_like(rows), past.episodes.lengths[rows], source="episode")
-    chosen = jax.random.bernoulli(key_choice, config.goal.achieved_goal_ratio, (num_envs,)) & (jnp.sum(past.num_complete) > 0)
-    achieved = env.achieved_goal(past.episodes.observations[rows, steps])
-    return episodes.replace(desired_goal=jnp.where(chosen[:, None], achieved, episodes.desired_goal), notes={REWARDED_BY_GOAL: chosen})
-
-
-def _progress(state: TrainState, config: TrainConfig) -> Array:
-    """() share of the run that is over."""
-    return jnp.minimum(state.env_steps / config.num_steps, 1.0)
-
-
 def _agent_schedule(state: TrainState, updates: Array, env: Environment, config: TrainConfig) -> Schedule:
-    """What holds for the agent at that number of updates: its schedules span the time between two resets."""
-    progress = _progress(state, config)
-    if config.agent_resets:
-        begins, ends = (jnp.asarray(shares)[state.resets] for shares in ((0.0, *config.agent_resets), (*config.agent_resets, 1.0)))
-        progress = jnp.clip((progress - begins) / (ends - begins), 0.0, 1.0)
-    return schedule(progress, updates - state.updates_at_reset, config.agent, action_dim=env.action_dim)
-
-
-def _reset_agent_if_due(state: TrainState, env: Environment, config: TrainConfig) -> TrainState:
-    """The agent is reset, and all else stays, at the first call after each share of the run in `agent_resets`."""
-    if not config.agent_resets:
-        return state
-    passed = jnp.sum(_progress(state, config) >= jnp.asarray(config.agent_resets))
-    key, key_agent = jax.random.split(state.key)
-    due, anew = passed > state.resets, agents.init(key_agent, state.agent.scale, config, action_dim=env.action_dim)
-    return state.replace(
-        agent=tree_where(due, anew.replace(imitation=state.agent.imitation), state.agent),
-        key=key,
-        resets=passed,
-        updates_at_reset=jnp.where(due, state.updates, state.updates_at_reset),
-    )
+    """What holds for the agent at that number of updates."""
+    progress = jnp.minimum(state.env_steps / config.num_steps, 1.0)
+    return schedule(progress, updates, config.agent, action_dim=env.action_dim)
 
 
 def warm_up_iterations(env: Environment, config: TrainConfig) -> int:
@@ -153,32 +109,31 @@ def act_at_random(env: Environment) -> Act:
 
 def _interact(key: Array, state: TrainState, guidance: Guidance, env: Steppable, config: TrainConfig, act: Act) -> TrainState:
     """One step of every environment, stored in the replay."""
-    key_act, key_reset, key_goals, key_nearby = jax.random.split(key, 4)
+    key_act, key_reset, key_nearby = jax.random.split(key, 3)
     before = state.rollout
     action = act(key_act, before.observation, before.desired_goal)
-    begun = _with_notes(_new_episodes(key_reset, guidance, env, config, state.curriculum), config)
+    begun = _new_episodes(key_reset, guidance, env, config, state.curriculum)
     after, time_step = rollout.step(before, begun, action, env)
     if state.curriculum is not None:
         ended = time_step.terminated | time_step.truncated
         state = state.replace(curriculum=curriculum.record(state.curriculum, before.origin, ended, time_step.reward > 0.0))
-    state = record(key_nearby, state, (action, time_step), guidance, env, config)
-    return continue_from(key_goals, state, after, time_step, env, config)
+    return record(key_nearby, state, (action, time_step, after), guidance, env, config)
 
 
-def record(key: Array, state: TrainState, taken: tuple[Array, TimeStep], guidance: Guidance, env: Environment, config: TrainConfig) -> TrainState:
-    """Stores one step of every environment in the replay.
+def record(
+    key: Array, state: TrainState, taken: tuple[Array, TimeStep, RolloutState], guidance: Guidance, env: Environment, config: TrainConfig
+) -> TrainState:
+    """Stores one step of every environment in the replay, and goes on from where it led.
 
     Args:
       key: random key.
       state: before the step.
-      taken: the actions (E, A) in [-1, 1], and the time steps (E, ...) that came of them, their observations the true next ones.
+      taken: the actions (E, A) in [-1, 1]; the time steps (E, ...) that came of them, their observations the true next ones; and where the
+        environments are now: in a new episode, those whose episode has ended.
       guidance, env, config: the run's; of the environment, only what goals and actions are.
-
-    Returns:
-      The state, whose episodes are still those of before the step, see `continue_from`.
     """
-    before, (action, time_step) = state.rollout, taken
-    notes = dict(before.notes)
+    before, (action, time_step, after) = state.rollout, taken
+    notes = {}
     if config.batch.uses_intersections:
         notes[NEARBY_GOAL] = nearby_goal(key, guidance.goals, time_step.observation, goal_test(guidance, env, config))
     recorded = RecordedStep(
@@ -191,15 +146,7 @@ def record(key: Array, state: TrainState, taken: tuple[Array, TimeStep], guidanc
         truncated=time_step.truncated,
         notes=notes,
     )
-    return state.replace(replay=replay.add(state.replay, recorded))
-
-
-def continue_from(key: Array, state: TrainState, after: RolloutState, time_step: TimeStep, env: Environment, config: TrainConfig) -> TrainState:
-    """Goes on from where the environments are after a recorded step: in a new episode, those whose episode has ended."""
-    if config.goal.has_achieved_goals:  # read after storing, so that the old replay can be donated
-        begun = _with_achieved_goals(key, after, state, env, config)
-        after = tree_where(time_step.terminated | time_step.truncated, begun, after)
-    return state.replace(rollout=after, env_steps=state.env_steps + config.steps_per_iteration)
+    return state.replace(replay=replay.add(state.replay, recorded), rollout=after, env_steps=state.env_steps + config.steps_per_iteration)
 
 
 def collect(state: TrainState, guidance: Guidance, *, env: Steppable, config: TrainConfig, num_iterations: int) -> TrainState:
@@ -225,7 +172,7 @@ def learn(state: TrainState, guidance: Guidance, *, env: Steppable, config: Trai
         state = _interact(key_interact, state.replace(key=key), guidance, env, config, act)
         return gradient_steps(key_updates, state, draw_batches(key_batch, state, guidance, env, config), env, config)
 
-    state, metrics = jax.lax.scan(iteration, _reset_agent_if_due(state, env, config), length=num_iterations)
+    state, metrics = jax.lax.scan(iteration, state, length=num_iterations)
     return state, jax.tree.map(jnp.mean, metrics)
 
 

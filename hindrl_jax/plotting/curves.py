@@ -28,7 +28,7 @@ def save_curve(result: Result, path: Path) -> None:
         if len(sampled) == len(result.rows):
             by_seed = 100 * np.reshape(sampled, success.shape)
             axes[0].plot(x, by_seed.mean(axis=1), color=MEAN, linewidth=1, linestyle=":", label="with sampled actions")
-        _mark_events(axes[0], result)
+        _mark_returned(axes[0], result)
         lengths = np.asarray(result.guidance.demonstrations.lengths) * result.config.num_held
         axes[1].axhline(lengths.mean(), color=DEMONSTRATION, linestyle="--", linewidth=1, label="demonstrations")
         axes[0].legend(loc="lower right", frameon=False)
@@ -90,10 +90,8 @@ def _curves(result: Result) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return table[:, 0, 0], table[:, :, 1], table[:, :, 2]
 
 
-def _mark_events(axis: Any, result: Result) -> None:
-    """Where the agent was reset, and the policies that are returned."""
-    for share in result.config.agent_resets:
-        axis.axvline(share * result.config.num_steps, color="0.7", linestyle=":", linewidth=1)
+def _mark_returned(axis: Any, result: Result) -> None:
+    """The policies that are returned."""
     if result.returned is not None:
         steps = result.returned.env_steps if result.config.learns_from_rollouts else result.returned.updates
         axis.scatter(steps, 100 * result.returned.success, s=18, color=RETURNED, marker="o", zorder=5, label="returned")

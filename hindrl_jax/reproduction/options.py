@@ -98,12 +98,6 @@ OPTIONS: tuple[Option, ...] = (
         "demonstration goals filtered by epsilon (the thesis's Smooth HinDRL)",
         (("algo", "smooth-hindrl"), ("goal.epsilon_filtering", True)),
     ),
-    Option(
-        "achieved-goals",
-        "goals",
-        "as goals-joint-union, and half of the rollouts aim at states reached earlier (thesis, chapter 6)",
-        (("goal.achieved_goal_ratio", 0.5), ("batch.hindrl_sampling_strategy", "joint_union")),
-    ),
     Option("n-step-1", "targets", "1-step returns in place of 5 (thesis)", (("batch.n_step", 1),)),
     Option("n-step-3", "targets", "3-step returns in place of 5", (("batch.n_step", 3),)),
     Option("gamma-0.99", "targets", "discount 0.99 in place of 0.98 (thesis)", (("batch.gamma", 0.99),)),
@@ -137,7 +131,6 @@ OPTIONS: tuple[Option, ...] = (
         "as bc-0.1, as far as the critics are sure that the demonstrated action is better (SPReD)",
         (("agent.q_filter", "smooth"), ("agent.bc_weight", 0.1)),
     ),
-    Option("bc-warm-start", "demonstrations", "500 gradient steps of cloning before the first of reinforcement learning", (("bc_warm_start", 500),)),
     Option(
         "imitation-proposal",
         "demonstrations",

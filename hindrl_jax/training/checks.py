@@ -126,16 +126,11 @@ def check_config(env: Environment, config: TrainConfig) -> None:
         )
     if config.own_goals and not own_goals:
         raise UserError(f"behavioural_goals = environment cannot be had in {name}, which gives its episodes no goals: choose another")
-    if isinstance(env, RelabelsObservations):
-        if config.batch.uses_intersections:
-            raise UserError(f"joint_intersection compares goals, and hindsight changes none in {name}: choose another hindrl_sampling_strategy")
-        if goal.has_achieved_goals:
-            raise UserError(f"achieved_goal_ratio is for tasks with other goals than their own, which {name} has not: set it to 0")
+    if isinstance(env, RelabelsObservations) and config.batch.uses_intersections:
+        raise UserError(f"joint_intersection compares goals, and hindsight changes none in {name}: choose another hindrl_sampling_strategy")
     if config.demo_reset_ratio > 0.0 and not (in_jax and isinstance(env, Restorable)):
         missing = "restorable states" if in_jax else "restorable states in JAX"
         raise UserError(f"{name} cannot begin in demonstrated states: it has no {missing}: set demo_reset_ratio to 0")
-    if not in_jax and config.agent_resets:
-        raise UserError(f"agent_resets = {config.agent_resets} needs a step in JAX, which {name} does not have: set it to ()")
     if not in_jax and config.action_chunks:
         raise UserError(f"action_chunks = True needs a step in JAX, which {name} does not have: set it to False, and each action is held")
 

@@ -139,9 +139,8 @@ def _train(result: Result, programs: Programs, report: Report) -> None:
     if begins and config.learns_from_rollouts:
         result.state = jax.block_until_ready(programs.collect(result.state, result.guidance))
         result.env_steps = programs.steps_at_random
-        if config.clones_first:
-            result.state = jax.block_until_ready(programs.warm_start(result.state, result.guidance))
-            result.updates = config.bc_warm_start
+        if config.imitation_proposal > 0:
+            result.state = jax.block_until_ready(programs.imitate(result.state, result.guidance))
     ends = result.kept.all_confirmed
     while result.steps_done < config.num_steps and not ends:
         result.state, metrics = programs.learn(result.state, result.guidance)

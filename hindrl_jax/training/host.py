@@ -29,7 +29,7 @@ from hindrl_jax.core.rollout import Evaluation, RolloutState
 from hindrl_jax.core.train import TrainState
 from hindrl_jax.training.devices import by_seed, shapes_on
 from hindrl_jax.training.host_playing import HostPolicies, evaluate, with_goals_of
-from hindrl_jax.training.programs import Programs, start, warm_start
+from hindrl_jax.training.programs import Programs, start
 
 
 @struct.dataclass(kw_only=True)
@@ -91,8 +91,8 @@ class HostPrograms(Programs):
                 pending["remember"] = compile_(self._trace(remember, state, plan, (step, begun), *rest, donate=True))
                 pending["decide"] = compile_(deciding)
                 pending["decide_at_random"] = compile_(self._trace(decide, *planning, at_random=True))
-            if config.clones_first:
-                pending["warm_start"] = compile_(self._trace(warm_start, state, *rest, donate=True))
+            if config.imitation_proposal > 0:
+                pending["imitate"] = compile_(self._trace(training.imitate, state, *rest, donate=True))
             self._programs = {name: program.result() for name, program in pending.items()}
 
     def start(self, seeds: Array, demonstrations: Episodes) -> tuple[Guidance, TrainState, Array]:
@@ -108,8 +108,8 @@ class HostPrograms(Programs):
             state = self._stepped(state, plan, guidance)
         return state
 
-    def warm_start(self, state: TrainState, guidance: Guidance) -> TrainState:
-        return self._programs["warm_start"](state, guidance, self.values)
+    def imitate(self, state: TrainState, guidance: Guidance) -> TrainState:
+        return self._programs["imitate"](state, guidance, self.values)
 
     def learn(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, Metrics]:
         if self.stepper is None:
@@ -167,7 +167,6 @@ class HostPrograms(Programs):
         if begun.desired_goal is None:
             key_goals = jax.vmap(functools.partial(jax.random.fold_in, data=6))(state.key)
             begun = jax.vmap(with_goals)(key_goals, begun, guidance)
-        begun = begun.replace(notes=jax.tree.map(jnp.zeros_like, state.rollout.notes))
         return self._put(state.replace(replay=state.replay.replace(step=jnp.zeros_like(state.replay.step)), rollout=begun))
 
     def _by_seed(self, arrays: Any) -> Any:
@@ -179,7 +178,7 @@ class HostPrograms(Programs):
 
 
 def _episodes(observation: Any, desired_goal: Any) -> RolloutState:
-    return RolloutState(env_state=(), observation=observation, desired_goal=desired_goal, notes={})
+    return RolloutState(env_state=(), observation=observation, desired_goal=desired_goal)
 
 
 def _time_step_shapes(shape: tuple[int, ...], observation_dim: int) -> TimeStep:
@@ -217,12 +216,10 @@ def remember(
 ) -> TrainState:
     """Stores a step that was taken outside JAX: the time step, and where the environments are now."""
     (time_step, now), before = taken, state.rollout
-    now = with_goals(jax.random.fold_in(plan.key_goals, 3), now, guidance)  # 3: the goals below split it in three
+    now = with_goals(plan.key_goals, now, guidance)
     ended = time_step.terminated | time_step.truncated
-    goal = jnp.where(ended[:, None], now.desired_goal, before.desired_goal)  # within an episode it may be one that was chosen here
-    after = now.replace(desired_goal=goal, notes={name: noted & ~ended for name, noted in before.notes.items()})
-    state = training.record(plan.key_nearby, state, (plan.action, time_step), guidance, env, config)
-    return training.continue_from(plan.key_goals, state, after, time_step, env, config)
+    goal = jnp.where(ended[:, None], now.desired_goal, before.desired_goal)
+    return training.record(plan.key_nearby, state, (plan.action, time_step, now.replace(desired_goal=goal)), guidance, env, config)
 
 
 def improve(state: TrainState, plan: Plan, guidance: Guidance, *, env: Environment, config: TrainConfig) -> tuple[TrainState, Metrics]:

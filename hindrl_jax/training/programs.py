@@ -84,8 +84,8 @@ class Programs(abc.ABC):
         """Fills the replay by random actions; the state is donated."""
 
     @abc.abstractmethod
-    def warm_start(self, state: TrainState, guidance: Guidance) -> TrainState:
-        """The gradient steps of behaviour cloning by `imitation_proposal` and `bc_warm_start`; the state is donated."""
+    def imitate(self, state: TrainState, guidance: Guidance) -> TrainState:
+        """Clones the policy that proposes beside the actor, see `imitation_proposal`; the state is donated."""
 
     @abc.abstractmethod
     def learn(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, Metrics]:
@@ -155,8 +155,8 @@ class JaxPrograms(Programs):
                 pending[f"evaluate {num_episodes}"] = compile_(self._trace(evaluate, key, actor, *rest, num_episodes=num_episodes))
             if config.learns_from_rollouts:
                 pending["collect"] = compile_(self._trace(training.collect, state, *rest, donate=True, num_iterations=self.warm_up), **_RUN_ONCE)
-            if config.clones_first:
-                pending["warm_start"] = compile_(self._trace(warm_start, state, *rest, donate=True))
+            if config.imitation_proposal > 0:
+                pending["imitate"] = compile_(self._trace(training.imitate, state, *rest, donate=True))
             self._programs = {name: program.result() for name, program in pending.items()}
 
     def start(self, seeds: Array, demonstrations: Episodes) -> tuple[Guidance, TrainState, Array]:
@@ -165,8 +165,8 @@ class JaxPrograms(Programs):
     def collect(self, state: TrainState, guidance: Guidance) -> TrainState:
         return self._programs["collect"](state, guidance, self.values)
 
-    def warm_start(self, state: TrainState, guidance: Guidance) -> TrainState:
-        return self._programs["warm_start"](state, guidance, self.values)
+    def imitate(self, state: TrainState, guidance: Guidance) -> TrainState:
+        return self._programs["imitate"](state, guidance, self.values)
 
     def learn(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, Metrics]:
         return self._programs["learn"](state, guidance, self.values)
@@ -195,15 +195,6 @@ def start(
     key_init, key_evaluate = jax.random.split(jax.random.key(seed))
     guidance = guidance_of(demonstrations, env, config)
     return guidance, training.init(key_init, guidance, env, config, begun=begun), key_evaluate
-
-
-def warm_start(state: TrainState, guidance: Guidance, *, env: Environment, config: TrainConfig) -> TrainState:
-    """The behaviour cloning before the first gradient step of reinforcement learning."""
-    if config.imitation_proposal > 0:
-        state = training.imitate(state, guidance, env=env, config=config)
-    if config.bc_warm_start > 0:
-        state, _ = training.clone(state, guidance, env=env, config=config, num_iterations=config.bc_warm_start)
-    return state
 
 
 def evaluate(key: Array, policy: Policy, guidance: Guidance, *, env: Steppable, config: TrainConfig, num_episodes: int) -> tuple[Array, Evaluation]:

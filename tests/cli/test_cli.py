@@ -71,7 +71,7 @@ def test_an_interrupt_does_not_outlive_its_command(monkeypatch):
         (["train", "--demos"], "hindrl: --demos needs a value after it (see"),
         (["train", "--seeds", "2", "3"], "hindrl train does not know what '3' is for: values stand behind their options (see"),
         (["train", "--n-envs", "1"], "did you mean --num-envs?"),
-        (["train", "--resets", "1"], "did you mean --agent-resets?"),
+        (["train", "--hold", "1"], "did you mean --action-hold?"),
         (["eval"], "hindrl eval needs DIRECTORY"),
         (["demos", "record", "--out", "x.hdf5"], "hindrl demos record needs --demos INT"),
         (["train", "--learning-rate", "fast"], "fast"),

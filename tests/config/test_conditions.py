@@ -69,9 +69,7 @@ VALUES = {
     "learning_starts": (30, 20),
     "demo_reset_ratio": (0.5, 0.25),
     "demo_reset_curriculum": (True, False),
-    "bc_warm_start": (2, 3),
     "imitation_proposal": (2, 3),
-    "agent_resets": ((0.5,), (0.25,)),
     "buffer_size": (60, 40),
     "batch_size": (16, 8),
     "max_demo_ratio": (0.5, 0.25),
@@ -87,7 +85,6 @@ VALUES = {
     "epsilon": (0.2, 0.3),
     "epsilon_filtering": (True, False),
     "behavioural_goals": ("task", "final_demonstration_states"),
-    "achieved_goal_ratio": (0.5, 0.25),
     "base": ("sac", "tqc"),
     "net_arch": ((5,), (4,)),
     "layer_norm": (True, False),
@@ -173,7 +170,6 @@ BASES = {
         "hindrl": {},
         "bc": dict(algo="bc"),
         "tqcfd": dict(algo="tqcfd", relabelled_per_original=0.0),
-        "tqcfd with achieved goals": dict(algo="tqcfd", relabelled_per_original=0.0, achieved_goal_ratio=0.5),
         "smooth-hindrl with sac": dict(algo="smooth-hindrl", epsilon_filtering=True, epsilon_steps=1, base="sac", demo_reset_ratio=0.5),
         "joint_union with sac and one critic": dict(hindrl_sampling_strategy="joint_union", base="sac", num_critics=1),
         "joint_intersection": dict(hindrl_sampling_strategy="joint_intersection"),
@@ -181,10 +177,9 @@ BASES = {
         "the other joint_intersection": dict(hindrl_sampling_strategy="joint_intersection", intersection_goals="demonstrations"),
         "no relabelling": dict(relabelled_per_original=0.0, final_target_entropy=None),
         "no demonstration rows": dict(max_demo_ratio=0.0),
-        "no demonstration rows, a warm start": dict(max_demo_ratio=0.0, bc_warm_start=1),
         "no demonstration rows, proposals of a clone": dict(max_demo_ratio=0.0, imitation_proposal=1),
         "networks of one's own": dict(actor_network=Tanh, critic_network=Tanh),
-        "no cloning": dict(bc_weight=0.0, agent_resets=(0.4,)),
+        "no cloning": dict(bc_weight=0.0),
     }.items()
 }
 # What the text of a program does not show: what is multiplied by zero there, or masked for all rows. The last three tests are about it.

@@ -88,7 +88,6 @@ BAD = [
     (GoalConfig, "epsilon", [-0.1, float("nan"), "0.1"]),
     (GoalConfig, "epsilon_filtering", [1]),
     (GoalConfig, "behavioural_goals", ["final"]),
-    (GoalConfig, "achieved_goal_ratio", [-0.1, 1.1, None]),
     (AgentConfig, "net_arch", [(), (8, 0), [8, 8], (8.0,), 8]),
     (AgentConfig, "layer_norm", [1]),
     (AgentConfig, "residual", [1]),
@@ -127,9 +126,7 @@ BAD = [
     (TrainConfig, "demo_reset_ratio", [-0.1, 1.1, None]),
     (TrainConfig, "action_hold", [0, -1, 2.5]),
     (TrainConfig, "stop_at", [0.0, -0.1, 1.01]),
-    (TrainConfig, "agent_resets", [(0.0,), (1.0,), (0.5, 0.5), (0.6, 0.3), (0.5, "1"), 0.5, None]),
     (TrainConfig, "demo_reset_curriculum", [0.5, True]),  # True without resets to demonstrated states
-    (TrainConfig, "bc_warm_start", [-1, 0.5]),
     (TrainConfig, "imitation_proposal", [-1, True]),
     (TrainConfig, "action_chunks", [1, None]),
     (TrainConfig, "buffer_size", [0, 1e6]),
@@ -191,7 +188,6 @@ def test_the_algorithm_must_fit_its_settings(fitting, contradiction, name):
 @pytest.mark.parametrize(
     "changes",
     [
-        dict(bc_warm_start=1),
         dict(imitation_proposal=1),
         dict(agent=AgentConfig(q_filter="hard")),
         dict(agent=AgentConfig(base="sac")),
@@ -234,7 +230,7 @@ def test_sources_of_relabelled_goals_by_hand(changes, sources):
         ({"batch": {"hindrl_sampling_strategy": "joint_union"}}, "union_sampling_ratio", None),
         ({"batch": {"relabelled_per_original": 0.0}}, "hindrl_sampling_strategy", "nothing is relabelled"),
         ({"batch": {"max_demo_ratio": 0.0}}, "bc_loss", "no demonstration rows to clone"),
-        ({"batch": {"max_demo_ratio": 0.0}, "bc_warm_start": 1}, "bc_loss", None),
+        ({"batch": {"max_demo_ratio": 0.0}, "imitation_proposal": 1}, "bc_loss", None),
         ({"agent": {"bc_weight": 0.0}}, "bc_action", "nothing is cloned"),
         ({"algo": "bc"}, "bc_action", None),
         ({}, "learning_rate", None),

@@ -14,7 +14,6 @@ from hindrl_jax.config import sweepable_value, with_traced_values
 from hindrl_jax.config.sweeps import SWEEPABLE
 from hindrl_jax.core import agent, train
 from hindrl_jax.core.guidance import guidance
-from hindrl_jax.training.programs import warm_start
 
 ENV, DEMONSTRATIONS = Corridor(), corridor_demonstrations()
 
@@ -43,8 +42,8 @@ class Stages:
     def collect(self, values, state, data):
         return train.collect(state, data, **self.given(values), num_iterations=train.warm_up_iterations(ENV, self.config)), data
 
-    def warm_up(self, values, state, data):
-        return warm_start(state, data, **self.given(values)), data
+    def imitate(self, values, state, data):
+        return train.imitate(state, data, **self.given(values)), data
 
     def clone(self, values, state, data):
         return agent.policy(train.clone(state, data, **self.given(values), num_iterations=2)[0].agent, average=True)
@@ -65,12 +64,12 @@ class Stages:
         if not self.config.learns_from_rollouts:
             return self.clone(values, *carry)
         carry = self.collect(values, *carry)
-        return self.learn(values, *(self.warm_up(values, *carry) if self.config.clones_first else carry))
+        return self.learn(values, *(self.imitate(values, *carry) if self.config.imitation_proposal else carry))
 
     def parts(self):
         """Most of the same, in parts."""
-        names = ("take", "begin", "clone") if not self.config.learns_from_rollouts else ("take", "begin", "collect", "warm_up", "draw", "descend")
-        return {name: getattr(self, name) for name in names if name != "warm_up" or self.config.clones_first}
+        names = ("take", "begin", "clone") if not self.config.learns_from_rollouts else ("take", "begin", "collect", "imitate", "draw", "descend")
+        return {name: getattr(self, name) for name in names if name != "imitate" or self.config.imitation_proposal}
 
 
 class Traced:

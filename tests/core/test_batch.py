@@ -20,7 +20,6 @@ from numbered_replay import (
     NUM_ADDS,
     NUM_DEMO,
     NUM_RELABELLED,
-    SLOTS,
     STRATEGIES,
     Numbered,
     NumberedTask,
@@ -28,7 +27,6 @@ from numbered_replay import (
     batch_of,
     check_rows,
     demonstrations,
-    expected_return,
     guidance,
     kept,
     replay_history,
@@ -36,7 +34,7 @@ from numbered_replay import (
 )
 
 from hindrl_jax.config import BatchConfig, QuirksConfig, TrainConfig
-from hindrl_jax.core.batch import REWARDED_BY_GOAL, num_demo_rows, rows_of_demonstrations, sample_batch, sample_demonstrations
+from hindrl_jax.core.batch import num_demo_rows, rows_of_demonstrations, sample_batch, sample_demonstrations
 
 NUMBERED = Numbered()
 
@@ -109,21 +107,6 @@ def test_relabelled_observations_are_about_states_of_their_source_in_their_order
     assert {"task_conditioned": foreign == 1.0, "joint_union": 0.0 < foreign < 1.0}.get(strategy, foreign == 0.0)
 
 
-def test_episodes_judged_by_their_goal_do_not_change_what_relabelled_observations_are_worth():
-    # No state equals a behavioural goal, so that original rows of such episodes get no reward.
-    history, _ = replay_history([[3, 2], [1, 3]])
-    replay, config = at(history, 17), TrainConfig(batch=batch_of("future"))
-    judged = replay.replace(notes={REWARDED_BY_GOAL: np.ones_like(replay.episodes.rewards, bool)})
-    expected, batch = (jax.device_get(draw_batch(jax.random.key(0), given, config, env=NumberedTask())) for given in (replay, judged))
-    np.testing.assert_array_equal(batch.observation, expected.observation)
-    relabelled, original = batch.is_relabelled, ~batch.is_relabelled & ~batch.is_demonstration
-    assert relabelled.sum() == NUM_RELABELLED
-    for name in ("reward", "discount", "next_observation"):
-        np.testing.assert_array_equal(getattr(batch, name)[relabelled], getattr(expected, name)[relabelled])
-    assert expected.reward[relabelled].any()
-    assert (expected.reward[original].any(), batch.reward[original].any()) == (True, False)
-
-
 def test_union_draws_from_both_sources_and_relabelling_can_be_off():
     history, _ = replay_history([[3], [3]])
     batch = draw_batch(jax.random.key(0), at(history, 20), TrainConfig(batch=batch_of("joint_union")))
@@ -146,31 +129,6 @@ def test_empty_intersections_keep_their_rows():
     odd = batch.observation[:, 1] % 2 == 1
     assert not batch.is_relabelled[odd].any()
     assert batch.is_relabelled.sum() > 100
-
-
-@pytest.mark.parametrize("n_step", [1, 2])
-def test_episodes_judged_by_their_goal_are_rewarded_for_reaching_it(n_step):
-    # Environment 0 plays episodes of 3 and means to reach state 2 of them; its rows, relabelled or not, are rewarded for their goal alone.
-    history, _ = replay_history([[3], [3]])
-    replay = at(history, 11)
-    goals = np.array(replay.episodes.desired_goals)
-    goals[:SLOTS] = replay.episodes.observations[:SLOTS, 2]
-    judged = np.broadcast_to(np.arange(2 * SLOTS)[:, None] < SLOTS, (2 * SLOTS, HORIZON))
-    replay = replay.replace(episodes=replay.episodes.replace(desired_goals=goals), notes={REWARDED_BY_GOAL: judged})
-    batch_config = dataclasses.replace(BATCH, relabelled_per_original=0.5, hindrl_sampling_strategy="final", n_step=n_step, max_demo_ratio=0.0)
-    config = TrainConfig(batch=batch_config)
-    batch = jax.device_get(draw_batch(jax.random.key(2), replay, config))
-    kinds = set()
-    for row, (state, goal) in enumerate(zip(triples(batch.observation), triples(batch.desired_goal), strict=True)):
-        env, episode, _ = state
-        in_hindsight = row < 64 // 3
-        assert goal == ((env, episode, 3) if in_hindsight else (0, episode, 2) if env == 0 else (-2, episode, 0))
-        by_goal = in_hindsight or env == 0
-        assert batch.is_relabelled[row] == in_hindsight
-        reward, discount, following = expected_return(state, 3, goal, by_goal=by_goal, config=config)
-        assert (batch.reward[row], batch.discount[row], *batch.next_observation[row]) == (reward, discount, *following)
-        kinds.add((env, in_hindsight))
-    assert len(kinds) == 4
 
 
 @pytest.mark.parametrize(

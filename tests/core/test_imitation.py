@@ -92,7 +92,7 @@ def test_no_imitation_is_kept_where_none_proposes():
 
 def test_the_imitation_is_cloned_and_all_else_stays_as_it_is():
     agent = dataclasses.replace(make_config().agent, learning_rate=1e-2)
-    config = make_config(agent=agent, imitation_proposal=300, agent_resets=(0.01,), batch=BatchConfig(batch_size=32))
+    config = make_config(agent=agent, imitation_proposal=300, batch=BatchConfig(batch_size=32))
     data, env = make_data(config), make_env()
     start = train.init(jax.random.key(0), data, env, config)
     state = jax.jit(functools.partial(train.imitate, env=env, config=config))(start, data)
@@ -102,7 +102,3 @@ def test_the_imitation_is_cloned_and_all_else_stays_as_it_is():
     act = train.make_policy(agents.policy(alone, average=False).replace(noise=0.0), env, make_config(agent=agent))
     action = act(jax.random.key(0), data.demonstrations.observations[:, 0], data.demonstrations.desired_goals)
     np.testing.assert_allclose(action[:, 1], -0.5, atol=0.2)  # all demonstrated second actions
-    # An agent that is reset keeps its imitation.
-    reset = jax.jit(functools.partial(train._reset_agent_if_due, env=env, config=config))(state.replace(env_steps=jnp.asarray(90)))
-    assert int(reset.resets) == 1
-    chex.assert_trees_all_equal(reset.agent.imitation, state.agent.imitation)

@@ -23,7 +23,6 @@ from toy_env import corridor_demonstrations
 from hindrl_jax.config import BatchConfig, GoalConfig
 from hindrl_jax.core import agent as agents
 from hindrl_jax.core import train
-from hindrl_jax.core.batch import REWARDED_BY_GOAL, sample_batch
 from hindrl_jax.core.hindsight import NEARBY_GOAL
 
 
@@ -148,72 +147,6 @@ def test_a_reverse_curriculum_moves_back_where_episodes_succeed():
             np.testing.assert_array_equal(episode.observations[0], demonstrations.observations[demo, int(episode.observations[0, 1])])
     _, curricula = run(jax.random.key(0), jnp.array([-9.0, 0.0, 0.0, 0.0]))
     assert (np.asarray(curricula.first_step) == lengths - 1).all()
-
-
-def test_achieved_goals_are_given_to_new_episodes_and_judge_them():
-    env = make_env()
-    batch = BatchConfig(batch_size=64, relabelled_per_original=0, n_step=1, max_demo_ratio=0.0)
-    config = make_config(goal=GoalConfig(epsilon_steps=0, achieved_goal_ratio=1.0), batch=batch)
-    data = make_data(config, (1.0,))
-
-    @jax.jit
-    def run(key):
-        key_init, key_batch = jax.random.split(key)
-        state = train.collect(train.init(key_init, data, env, config), data, env=env, config=config, num_iterations=60)
-        return state, sample_batch(key_batch, state.replay, data, state.env_steps, env, config)
-
-    state, batch = run(jax.random.key(0))
-    batch = jax.device_get(batch)
-    replay, task_goal = jax.device_get(state.replay), float(data.behavioural_goals.goals[0, 0])
-    goals, seen, num_episodes = [], set(), 0
-    for row, length, episode in recorded_episodes(replay):
-        (judged,) = set(replay.notes[REWARDED_BY_GOAL][row, :length].tolist())  # the same in all of an episode
-        if judged:
-            goals.append(float(episode.desired_goals[0]))
-        else:
-            assert float(episode.desired_goals[0]) == task_goal
-        seen |= set(episode.observations[: length + 1, 2].tolist())
-        num_episodes += 1
-    assert set(goals) <= seen  # each was reached in some episode
-    assert len(set(goals)) > 10
-    assert len(goals) >= num_episodes - 2 * NUM_ENVS  # all but the first episodes, when there was no past
-    # Rows of those episodes are rewarded for their goal alone, and only where it is reached exactly; the others by the environment.
-    judged = batch.desired_goal[:, 0] != task_goal
-    assert judged.sum() > 0
-    assert not batch.is_relabelled.any()
-    reached = batch.next_observation[:, 2] == batch.desired_goal[:, 0]
-    np.testing.assert_array_equal(batch.reward[judged], reached[judged])
-    solved = batch.next_observation[:, 2] > env.width
-    np.testing.assert_array_equal(batch.discount == 0.0, (judged & reached) | solved)
-
-
-def test_achieved_goals_cost_no_copy_of_the_replay(data):
-    config = make_config(goal=GoalConfig(achieved_goal_ratio=0.5))
-    state = jax.eval_shape(lambda key: train.init(key, data, make_env(), config), jax.random.key(0))
-    run = functools.partial(train.learn, env=make_env(), config=config, num_iterations=LEARN_STEPS)
-    memory = jax.jit(run, donate_argnums=0).lower(state, data).compile().memory_analysis()
-    assert memory.temp_size_in_bytes < state.replay.episodes.actions.size * 4
-
-
-def test_the_share_of_achieved_goals():
-    env, goal = make_env(), GoalConfig(achieved_goal_ratio=0.8)
-    config = make_config(goal=goal, num_envs=500, buffer_size=500 * 2 * HORIZON, steps=10**6)
-    data = make_data(config, (1.0,))
-
-    @jax.jit
-    def judged(key):
-        key_init, key_new, key_goals = jax.random.split(key, 3)
-        state = train.collect(train.init(key_init, data, env, config), data, env=env, config=config, num_iterations=HORIZON)
-        episodes = train._new_episodes(key_new, data, env, config, 0.0)
-
-        def at(env_steps, key):
-            begun = train._with_achieved_goals(key, episodes, state.replace(env_steps=env_steps), env, config)
-            return jnp.sum(begun.notes[REWARDED_BY_GOAL])
-
-        return jax.vmap(at)(jnp.array([0, 500_000, 1_000_000]), jax.random.split(key_goals, 3))
-
-    # Of 500: 400 all along the run; standard deviation 9.
-    np.testing.assert_allclose(judged(jax.random.key(0)), [400, 400, 400], atol=45)
 
 
 def test_a_demonstrated_goal_near_the_end_of_each_transition_is_noted_where_intersections_need_it():

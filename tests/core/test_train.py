@@ -179,11 +179,11 @@ def test_reset_and_step_are_traced_once(data):
     assert time_step.reward.shape == (4,)
 
 
-def test_warm_start_clones_the_actor_and_its_average_follows(data):
+def test_cloning_moves_the_actor_alone_and_its_average_follows(data):
     agent = dataclasses.replace(make_config().agent, learning_rate=1e-2, actor_average_span=0.02)
-    config = make_config(agent=agent, bc_warm_start=300, batch=BatchConfig(batch_size=32))
+    config = make_config(agent=agent, batch=BatchConfig(batch_size=32))
     start = train.init(jax.random.key(0), data, make_env(), config)
-    run = functools.partial(train.clone, env=make_env(), config=config, num_iterations=config.bc_warm_start)
+    run = functools.partial(train.clone, env=make_env(), config=config, num_iterations=300)
     warm, metrics = jax.jit(run)(start, data)
     chex.assert_tree_all_finite((warm.agent, metrics))
     assert (int(warm.updates), int(warm.env_steps)) == (300, 0)
@@ -270,28 +270,3 @@ def test_with_span_1_the_averaged_actor_is_the_mean_of_all_actors(data):
     chex.assert_trees_all_close(state.agent.average_actor, mean, atol=1e-6)
     chex.assert_trees_all_close(actors[0], actors[3], atol=0.1)
     assert np.abs(mean["params"]["Dense_0"]["kernel"] - actors[3]["params"]["Dense_0"]["kernel"]).max() > 1e-4
-
-
-def test_the_agent_is_reset_once_and_the_replay_stays(data):
-    """A reset halfway, at step 51: collecting takes 42 steps, each call of `learn` 9 more and 6 updates."""
-    config = make_config(agent_resets=(0.5,))
-    run = jax.jit(functools.partial(train.learn, env=make_env(), config=config, num_iterations=LEARN_STEPS))
-    steps, states = [], [collected(0, data)]
-    for _ in range(3):
-        state, _ = run(states[-1], data)
-        states.append(state)
-        steps.append((int(state.env_steps), int(state.resets), int(state.updates_at_reset), int(state.agent.actor_optimiser.count)))
-    # The second call begins at step 51, so its 6 updates are the first ones of the new agent; the third goes on with it.
-    assert steps == [(51, 0, 0, 6), (60, 1, 6, 6), (69, 1, 6, 12)]
-    assert [int(state.updates) for state in states[1:]] == [6, 12, 18]
-    assert (np.asarray(states[3].replay.num_complete) >= np.asarray(states[1].replay.num_complete)).all()
-    assert np.asarray(states[3].replay.num_complete).sum() > 0
-    # Schedules span the time between resets: at step 60 a sixth of 51 steps or less is over, and the target entropy rises from -1000 to 1000.
-    never = make_config()
-    before = train._agent_schedule(states[2], states[2].updates, make_env(), never)
-    after = train._agent_schedule(states[2], states[2].updates, make_env(), config)
-    np.testing.assert_allclose(before.target_entropy, -1000.0 + 2000.0 * 60 / 102, rtol=1e-6)
-    np.testing.assert_allclose(after.target_entropy, -1000.0 + 2000.0 * (60 - 51) / 51, rtol=1e-6)
-    np.testing.assert_allclose(after.actor_average_rate, 1.0 / (1.0 + 0.25 * 6), rtol=1e-6)
-    first = train._agent_schedule(states[0], states[0].updates, make_env(), config)
-    np.testing.assert_allclose(first.target_entropy, -1000.0 + 2000.0 * 42 / 51, rtol=1e-6)

@@ -120,7 +120,6 @@ RLPD = {
     "gamma": 0.99,
     "clip_targets": False,
     "bc_weight": 0.0,
-    "bc_warm_start": 0,
     "num_envs": 1,
     "action_hold": 1,
     "updates_per_iteration": 20,
