@@ -90,7 +90,10 @@ def remarks(compared: Sequence[Comparison]) -> list[str]:
         lines.append("bc takes no environment steps: its steps are gradient steps")
     if any(one.difference is not None and not one.paired for one in compared):
         lines.append("where the seeds are not those of the first run, the difference is one of means (marked ~), else it is taken seed by seed")
-    if min(len(run.spec.seeds) for run in runs) < FEW_SEEDS:
+    numbers = [len(run.spec.seeds) for run in runs]
+    if 1 in numbers:
+        lines.append("a single seed has no interval: train several, for example --seeds 8")
+    if any(1 < number < FEW_SEEDS for number in numbers):
         lines.append(f"with fewer than {FEW_SEEDS} seeds the intervals are much too narrow")
     return lines
 

@@ -86,6 +86,16 @@ def test_bc_counts_gradient_steps(first, tmp_path):
     assert "bc takes no environment steps: its steps are gradient steps" in remarks([_, bc])
 
 
+def test_what_few_seeds_cannot_tell_is_said(first, tmp_path):
+    alone = write(tmp_path / "alone", [[1.0]], final=[1.0], seeds=(0,))
+    lacking, narrow = (
+        "a single seed has no interval: train several, for example --seeds 8",
+        "with fewer than 8 seeds the intervals are much too narrow",
+    )
+    for paths, expected in (([alone], [lacking]), ([first], [narrow]), ([first, alone], [lacking, narrow])):
+        assert [line for line in remarks(compare(read_runs(paths))) if "interval" in line] == expected
+
+
 def test_other_environments_and_other_settings_are_named(first, tmp_path):
     three = write(tmp_path / "three", [[0.0], [0.0]], env=dataclasses.replace(ENV, num_objects=3), num_envs=64)
     run, other = read_runs([first, three])
