@@ -132,16 +132,24 @@ def task(name: str) -> Task:
     if module:
         _import_from_here(module)
     if name not in TASKS:
+        registered = [known for known, entry in TASKS.items() if entry.environment.__module__ == module]
+        if registered:
+            raise UserError(f"unknown environment {name!r}: {module} registers {', '.join(registered)}, by the `name` of the class; choose that")
         where = f", not even by {module!r}, which is to call hindrl_jax.register" if module else ""
         own = "" if module else ", gymnasium:ID, or MODULE:NAME for a task of your own"
         raise UserError(f"unknown environment {name!r}{where}{did_you_mean(name, TASKS)}; choose one of {', '.join(TASKS)}{own}")
     return TASKS[name]
 
 
+def is_own(env: Environment) -> bool:
+    """Whether somebody has registered it who is not this project."""
+    return env.name in TASKS and env.name not in _BUILT_IN
+
+
 def full_name(env: Environment) -> str:
     """The name by which `make` finds the environment again, in another process too: with its module unless it is this project's own."""
     module = type(env).__module__
-    return env.name if env.name in _BUILT_IN or env.name not in TASKS or module == "__main__" else f"{module}:{env.name}"
+    return f"{module}:{env.name}" if is_own(env) and module != "__main__" else env.name
 
 
 def _import_from_here(module: str) -> None:

@@ -75,6 +75,21 @@ def test_a_film_that_cannot_be_drawn_is_a_warning(saved, tmp_path, monkeypatch):
     assert hindrl.load_run(tmp_path).spec.seeds == (0,)
 
 
+def test_a_viewer_of_ones_own_that_fails_is_a_warning_of_one_line(saved, tmp_path, monkeypatch):
+    class Viewer:
+        def animation(self, env, states, captions=None):
+            return [state.no_such_field for state in states], []
+
+    monkeypatch.setattr(films, "viewer", lambda env: Viewer())
+    monkeypatch.setattr(films, "is_own", lambda env: True)
+    with pytest.warns(UserWarning, match=r"no episode\.gif: the viewer of .* fails \(AttributeError: .*no_such_field.*\): mend it"):
+        hindrl.save_run(tmp_path / "run", saved[0])
+    assert (tmp_path / "run" / "summary.json").exists()
+    monkeypatch.setattr(films, "is_own", lambda env: False)
+    with pytest.raises(AttributeError):  # one of ours is a bug, and says where
+        hindrl.load_run(tmp_path / "run").render(tmp_path / "film.gif")
+
+
 def test_damaged_parameters_are_refused(saved, tmp_path):
     result, path = saved
     with pytest.raises(hindrl.UserError, match="already holds a run"):

@@ -108,7 +108,7 @@ def test_viewer_may_be_an_object_or_the_name_of_a_module(forget, tmp_path):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("two_rooms:Nope", "unknown environment 'Nope', not even by 'two_rooms', which is to call hindrl_jax.register"),
+        ("two_rooms:Nope", "unknown environment 'Nope': two_rooms registers TwoRooms, by the `name` of the class; choose that"),
         ("no_such_module:Nope", "there is no module 'no_such_module': start the command in the folder where it is"),
         ("FixedGridPickAndPlac", "did you mean 'FixedGridPickAndPlace'?"),
         ("Nope", "or MODULE:NAME for a task of your own"),
