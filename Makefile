@@ -16,7 +16,7 @@ NEWEST_TOOLS = pytest pytest-xdist hypothesis ipython
 
 .PHONY: train test test-newest test-versions test-slow test-fuzz test-interop coverage lint docs notebooks check-docs package bench clean
 
-train: .venv/.installed  ## one demonstration, one seed, until it is solved: about two minutes with the installation
+train: .venv/.installed  ## one demonstration, one seed, until it is solved: two or three minutes with the installation
 	.venv/bin/hindrl train --env FixedGridPickAndPlace --algo hindrl --demos 1 --seed 2 --stop-at 0.98 --out runs/quickstart --overwrite
 
 test: .venv/.installed-test  ## two files at a time; .pytest_cache keeps what it compiles for the next time

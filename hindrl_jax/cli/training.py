@@ -130,8 +130,10 @@ def _little_solved(spec: RunSpec, success: float, out: Path) -> list[str]:
     number = int(spec.demos) if is_number(spec.demos) else None
     more = "" if number is None else f" (--demos {number * (10 if number < 10 else 2)})"
     seeds = " and more seeds (--seeds 4)" if len(spec.seeds) == 1 else ""
-    can_imitate = spec.config.algo != "bc" and (number is None or number >= _ENOUGH_TO_IMITATE)
-    imitation = "imitation alone, which takes less than a minute (--algo bc); " if can_imitate else ""
+    imitation = ""
+    if spec.config.algo != "bc" and (number is None or number >= _ENOUGH_TO_IMITATE):
+        few = f", from {_ENOUGH_TO_IMITATE} demonstrations on" if number is None else ""
+        imitation = f"imitation alone, which takes less than a minute (--algo bc{few}); "
     return [
         f"{success:.0%} of the episodes were solved. What may help: {imitation}a longer run (--steps {2 * spec.config.num_steps}){seeds};",
         f"more demonstrations{more}, above all of starts where it fails: `hindrl render {shlex.quote(str(out))} --episodes 5` films five",

@@ -59,7 +59,7 @@ class TrainConfig:
     eval_every: int = 4_000
     """Environment steps (bc: gradient steps) between evaluations."""
     eval_episodes: int = 100
-    """Episodes of each evaluation, played once with mean and once with sampled actions."""
+    """Episodes of each evaluation, played with mean actions and, but for bc, once more with sampled ones."""
     batch: BatchConfig = dataclasses.field(default_factory=BatchConfig)
     goal: GoalConfig = dataclasses.field(default_factory=GoalConfig)
     agent: AgentConfig = dataclasses.field(default_factory=AgentConfig)

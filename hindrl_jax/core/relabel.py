@@ -45,11 +45,12 @@ def relabel(key: Array, replay: ReplayState, steps: Steps, chosen: Array, source
         solved = jnp.any(steps.is_last & (steps.rewards > 0.0), axis=1)
         steps = steps.replace(terminated=steps.terminated & ~(chosen & solved))
     goals = jnp.where(chosen[:, None], test.achieved_goal(observations), steps.desired_goal)
-    return reward_by_goal(steps.replace(desired_goal=goals, is_relabelled=chosen), chosen, test)
+    return reward_by_goal(steps.replace(desired_goal=goals, is_relabelled=chosen), test)
 
 
-def reward_by_goal(steps: Steps, chosen: Array, test: GoalTest) -> Steps:
-    """Rewards chosen rows (B,) for reaching their desired goals, rather than as recorded; unless `test` says otherwise they end there."""
+def reward_by_goal(steps: Steps, test: GoalTest) -> Steps:
+    """Rewards relabelled rows for reaching their new goals, rather than as recorded; unless `test` says otherwise they end there."""
+    chosen = steps.is_relabelled
     reached = test.reached(steps.next_observations, steps.desired_goal[:, None]) & chosen[:, None]
     return steps.replace(
         rewards=jnp.where(chosen[:, None], reached.astype(jnp.float32), steps.rewards),

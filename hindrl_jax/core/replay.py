@@ -43,7 +43,7 @@ class RecordedStep(struct.PyTreeNode, kw_only=True):
     notes: dict[str, Array]  # leaves (E,), of the names that the replay was made for
 
 
-def init(env: Environment, *, num_envs: int, capacity: int, notes: Mapping[str, bool | int] | None = None) -> ReplayState:
+def init(env: Environment, *, num_envs: int, capacity: int, notes: Mapping[str, int] | None = None) -> ReplayState:
     """An empty replay.
 
     Args:

@@ -26,7 +26,7 @@ from hindrl_jax.core.hindsight import NEARBY_GOAL
 from hindrl_jax.core.inputs import network_inputs
 from hindrl_jax.core.replay import RecordedStep, ReplayState
 from hindrl_jax.core.rollout import Act, DemoResets, Evaluation, RolloutState
-from hindrl_jax.core.schedules import Schedule, schedule
+from hindrl_jax.core.schedules import schedule
 
 
 class TrainState(struct.PyTreeNode, kw_only=True):
@@ -75,12 +75,6 @@ def _new_episodes(key: Array, guidance: Guidance, env: Steppable, config: TrainC
     if guidance.starts is not None:
         demo_resets = DemoResets(starts=guidance.starts, ratio=config.demo_reset_ratio, curriculum=begins)
     return rollout.reset(key, env, guidance.behavioural_goals, config.num_envs, demo_resets)
-
-
-def _agent_schedule(state: TrainState, updates: Array, env: Environment, config: TrainConfig) -> Schedule:
-    """What holds for the agent at that number of updates."""
-    progress = jnp.minimum(state.env_steps / config.num_steps, 1.0)
-    return schedule(progress, updates, config.agent, action_dim=env.action_dim)
 
 
 def warm_up_iterations(env: Environment, config: TrainConfig) -> int:
@@ -184,12 +178,13 @@ def draw_batches(key: Array, state: TrainState, guidance: Guidance, env: Environ
 
 def gradient_steps(key: Array, state: TrainState, batches: Transition, env: Environment, config: TrainConfig) -> tuple[TrainState, Metrics]:
     """One gradient step for each of the batches, leaves (U, B, ...), and their mean metrics."""
-    num_updates = batches.reward.shape[0]
+    num_updates, progress = batches.reward.shape[0], jnp.minimum(state.env_steps / config.num_steps, 1.0)
 
     def gradient_step(carry: tuple[Array, AgentState], update: tuple[Array, Transition]) -> tuple[tuple[Array, AgentState], Metrics]:
         (key, agent), (index, batch) = carry, update
         key, key_update = jax.random.split(key)
-        agent, metrics = agents.update(key_update, agent, batch, _agent_schedule(state, state.updates + index, env, config), config)
+        moment = schedule(progress, state.updates + index, config.agent, action_dim=env.action_dim)
+        agent, metrics = agents.update(key_update, agent, batch, moment, config)
         shares = {
             "batch/relabelled": jnp.mean(batch.is_relabelled),
             "batch/demonstrations": jnp.mean(batch.is_demonstration),

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from hindrl_jax.base.environments import Environment
 from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.base.extras import require
-from hindrl_jax.tasks.registry import is_own, viewer
+from hindrl_jax.tasks.registry import is_registered_by_user, viewer
 
 SUFFIXES = (".gif", ".mp4", ".png")
 _FRAMES_PER_SECOND = 20  # the arm's control rate, and three frames for each step of a grid
@@ -48,32 +49,34 @@ def save_film(env: Environment, episodes: Sequence[Sequence[Any]], path: Path) -
     """
     from hindrl_jax.envs import drawing  # not with this module: it loads Pillow, which only drawing needs
 
-    draw = viewer(env)
-    if draw is None:
-        raise UserError(f"{env.name} has no viewer to draw it: give one to hindrl_jax.register")
-    if path.suffix == ".png":
-        _drawn(env, draw.save_png, env, episodes[-1][-1], path)
-        return
-    pictures: list[np.ndarray] = []
-    seconds: list[float] = []
-    for number, states in enumerate(episodes, 1):
-        if pictures:
-            seconds[-1] += drawing.LINGER
-        captions = [f"{env.name}, {number} of {len(episodes)}"] * len(states) if len(episodes) > 1 else None
-        more_pictures, more_seconds = _drawn(env, draw.animation, env, states, captions=captions)
-        pictures += more_pictures
-        seconds += more_seconds
-    save_pictures(pictures, seconds, path)
+    with _failures_of_the_viewer(env):
+        draw = viewer(env)
+        if draw is None:
+            raise UserError(f"{env.name} has no viewer to draw it: give one to hindrl_jax.register")
+        if path.suffix == ".png":
+            draw.save_png(env, episodes[-1][-1], path)
+            return
+        pictures: list[np.ndarray] = []
+        seconds: list[float] = []
+        for number, states in enumerate(episodes, 1):
+            if pictures:
+                seconds[-1] += drawing.LINGER
+            captions = [f"{env.name}, {number} of {len(episodes)}"] * len(states) if len(episodes) > 1 else None
+            more_pictures, more_seconds = draw.animation(env, states, captions=captions)
+            pictures += more_pictures
+            seconds += more_seconds
+        save_pictures(pictures, seconds, path)
 
 
-def _drawn(env: Environment, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-    """Calls a function of the task's viewer. One that fails for a task of one's own is the person's to mend, and no bug of ours."""
+@contextlib.contextmanager
+def _failures_of_the_viewer(env: Environment) -> Iterator[None]:
+    """A viewer that somebody gave to `register` and that fails, or draws what is no picture, is theirs to mend, and no bug of ours."""
     try:
-        return function(*arguments, **options)
+        yield
     except (UserError, OSError):
         raise
     except Exception as error:  # of any kind: it is somebody else's code
-        if not is_own(env):
+        if not is_registered_by_user(env):
             raise
         said = f"{type(error).__name__}: {one_line(error)}"
         raise UserError(f"the viewer of {env.name} fails ({said}): mend it, or give hindrl_jax.register none") from error

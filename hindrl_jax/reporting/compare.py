@@ -92,7 +92,7 @@ def remarks(compared: Sequence[Comparison]) -> list[str]:
         lines.append("where the seeds are not those of the first run, the difference is one of means (marked ~), else it is taken seed by seed")
     numbers = [len(run.spec.seeds) for run in runs]
     if 1 in numbers:
-        lines.append("a single seed has no interval: train several, for example --seeds 8")
+        lines.append(f"a single seed has no interval: train several, for example --seeds {FEW_SEEDS}")
     if any(1 < number < FEW_SEEDS for number in numbers):
         lines.append(f"with fewer than {FEW_SEEDS} seeds the intervals are much too narrow")
     return lines

@@ -44,7 +44,7 @@ class Films:
 
     @in_float32
     def film_when_due(self, result: Result) -> None:
-        """Films an episode if another `every` steps are over. One that cannot be drawn, for want of OpenGL, is a warning: the run is worth more.
+        """Films an episode if another `every` steps are over. One that cannot be drawn is a warning: the run is worth more.
 
         A run that is resumed goes on with the films after its checkpoint.
         """

@@ -126,7 +126,8 @@ class RunWriter:
     def finish(self, result: Result, *, film: bool = True) -> dict[str, Any]:
         """Writes the parameters, the summary, the curve and (unless `film` is off) the film of an episode; returns the summary.
 
-        A film that cannot be drawn, for want of OpenGL, is a warning: the run is worth more. A task without a viewer has no film.
+        A film that cannot be drawn, for want of OpenGL or by a fault of the task's viewer, is a warning: the run is worth more. A task without a
+        viewer has no film.
         """
         self.report(result.rows)
         summary = summarise(result)

@@ -132,7 +132,7 @@ def task(name: str) -> Task:
     if module:
         _import_from_here(module)
     if name not in TASKS:
-        registered = [known for known, entry in TASKS.items() if entry.environment.__module__ == module]
+        registered = [known for known, entry in TASKS.items() if f"{entry.environment.__module__}.".startswith(f"{module}.")]
         if registered:
             raise UserError(f"unknown environment {name!r}: {module} registers {', '.join(registered)}, by the `name` of the class; choose that")
         where = f", not even by {module!r}, which is to call hindrl_jax.register" if module else ""
@@ -141,15 +141,15 @@ def task(name: str) -> Task:
     return TASKS[name]
 
 
-def is_own(env: Environment) -> bool:
-    """Whether somebody has registered it who is not this project."""
+def is_registered_by_user(env: Environment) -> bool:
+    """Whether somebody else than this project has registered it."""
     return env.name in TASKS and env.name not in _BUILT_IN
 
 
 def full_name(env: Environment) -> str:
     """The name by which `make` finds the environment again, in another process too: with its module unless it is this project's own."""
     module = type(env).__module__
-    return f"{module}:{env.name}" if is_own(env) and module != "__main__" else env.name
+    return f"{module}:{env.name}" if is_registered_by_user(env) and module != "__main__" else env.name
 
 
 def _import_from_here(module: str) -> None:
@@ -192,7 +192,7 @@ def viewer(env: Environment) -> Any:
 
 def is_drawn(env: Environment) -> bool:
     """Whether there are films of this environment: it shows itself, or something draws it."""
-    return isinstance(env, Watchable) or viewer(env) is not None
+    return isinstance(env, Watchable) or task(env.name).viewer is not None
 
 
 def checked(build: Callable[[], Any]) -> Any:

@@ -56,7 +56,7 @@ def check_dimensions(env: Environment) -> None:
     Raises:
       UserError: naming the first dimension that does not fit; or where `step` fails with an action of the length that the environment states.
     """
-    if not can_step(env) or _is_own(env):
+    if not can_step(env) or _is_of_this_package(env):
         return
     state, observation = jax.eval_shape(env.reset, jax.random.key(0))
     _expect(env, "observation_dim", env.observation_dim, "reset gives an observation", observation)
@@ -86,7 +86,7 @@ def check_expert(env: Environment, expert: Any) -> None:
     Raises:
       UserError: if it does not.
     """
-    if not can_step(env) or _is_own(expert):
+    if not can_step(env) or _is_of_this_package(expert):
         return
     state, _ = jax.eval_shape(env.reset, jax.random.key(0))
     action = jax.eval_shape(lambda key, begun: jnp.asarray(expert.act(key, env, begun)), jax.random.key(0), state)
@@ -100,7 +100,7 @@ def _expect(env: Environment, name: str, length: int, gives: str, found: Any) ->
         raise UserError(f"{env.name}: {name} is {length}, and {gives} {shape}: mend the one or the other")
 
 
-def _is_own(thing: Any) -> bool:
+def _is_of_this_package(thing: Any) -> bool:
     return type(thing).__module__.startswith("hindrl_jax.")
 
 

@@ -1,4 +1,4 @@
-"""The compiled programs of an experiment: start, collect, warm start, learn, evaluate; each for all its runs at once.
+"""The compiled programs of an experiment: start, collect, imitate, learn, evaluate; each for all its runs at once.
 
 `Programs` is what they have in common. `JaxPrograms` hold the whole loop, environments included; `host.HostPrograms` are the pieces between which
 environments are stepped outside JAX.
@@ -198,6 +198,6 @@ def start(
 
 
 def evaluate(key: Array, policy: Policy, guidance: Guidance, *, env: Steppable, config: TrainConfig, num_episodes: int) -> tuple[Array, Evaluation]:
-    """Fresh episodes with mean actions, and the key of later ones."""
+    """Fresh episodes with the policy's own noise, and the key of later ones."""
     key, key_play = jax.random.split(key)
     return key, training.evaluate(key_play, policy, guidance, env=env, config=config, num_episodes=num_episodes)

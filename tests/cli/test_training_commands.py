@@ -85,13 +85,14 @@ def test_a_run_that_solves_little_says_what_to_try():
     assert -1 not in places
     assert places == sorted(places)
     assert "--algo bc" not in lines[0]  # one demonstration is too little to imitate
-    thirty = advised(dataclasses.replace(spec, demos="30"), 0.43)
-    assert "--algo bc" in thirty[0]
-    assert "--demos 60" in thirty[1]
+    for number, said in (("4", False), ("5", True), ("mine.hdf5", True)):
+        assert ("--algo bc" in advised(dataclasses.replace(spec, demos=number), 0.43)[0]) == said
+    assert "--demos 60" in advised(dataclasses.replace(spec, demos="30"), 0.43)[1]
     assert "--algo bc" not in advised(dataclasses.replace(spec, demos="30", config=preset("bc")), 0.43)[0]
     of_file = "\n".join(advised(dataclasses.replace(spec, demos="mine.hdf5", seeds=(0, 1)), 0.9, 0.2))
     assert of_file.startswith("55% ")
     assert "--demos" not in of_file
+    assert "--algo bc, from 5 demonstrations on" in of_file
     assert "--seeds" not in of_file
 
 

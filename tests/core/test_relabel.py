@@ -183,17 +183,16 @@ def test_a_demonstrated_goal_is_one_of_the_table():
 
 
 @pytest.mark.parametrize(("quirks", "ends"), [(QuirksConfig(), True), (QuirksConfig(bootstrap_past_relabelled_goals=True), False)])
-def test_chosen_rows_are_rewarded_for_their_own_goal_by_hand(quirks, ends):
-    # All rows were acted under the goal 9, and epsilon is 1. Rows 0 and 1 are episode 1 from step 0 on: position 7 is 2 away, 8 is 1 away, so row 0
-    # is rewarded for reaching its goal by the second step. Row 1 is not chosen, and keeps the reward that was recorded there. Row 2 is episode 0
+def test_relabelled_rows_are_rewarded_for_their_goal_by_hand(quirks, ends):
+    # The goal of all rows is 9, and epsilon is 1. Rows 0 and 1 are episode 1 from step 0 on: position 7 is 2 away, 8 is 1 away, so row 0
+    # is rewarded for reaching its goal by the second step. Row 1 is not relabelled, and keeps the reward that was recorded there. Row 2 is episode 0
     # from step 1 on: positions 2 and 4 are 7 and 5 away.
     replay = replay_of_both()
     steps = read_steps(replay.episodes, jnp.array([1, 1, 0]), jnp.array([0, 0, 1]), 2)
-    steps = reward_by_goal(steps, jnp.array([True, False, True]), goal_test(quirks))
+    steps = reward_by_goal(steps.replace(is_relabelled=jnp.array([True, False, True])), goal_test(quirks))
     assert steps.rewards.tolist() == [[0.0, 1.0], [0.0, 1.0], [0.0, 0.0]]
     assert steps.ends.tolist() == [[False, ends], [False, False], [False, False]]
     assert steps.desired_goal[:, 0].tolist() == [9.0] * 3
-    assert steps.is_relabelled.tolist() == [False] * 3
 
 
 @dataclasses.dataclass(frozen=True)

@@ -146,7 +146,7 @@ def test_transitions_are_those_of_a_plain_loop(lengths, places, terminated, rows
     table, chosen = jax.tree.map(jnp.asarray, episodes), jnp.asarray(by_goal)
     recorded = read_steps(table, jnp.asarray(row), jnp.asarray(first), config.batch.n_step)
     given_goals = recorded.replace(desired_goal=jnp.where(chosen[:, None], goals, recorded.desired_goal), is_relabelled=chosen)
-    steps = reward_by_goal(given_goals, chosen, test)
+    steps = reward_by_goal(given_goals, test)
     batch = jax.device_get(transitions(steps, test.achieved_goal, config, is_demonstration=is_demonstration))
     for i in range(ROWS):
         reward, discount, following, goal = transition_twin(
@@ -168,7 +168,7 @@ def test_jitted_equals_not_jitted():
     def read(episodes, rows, steps, goals):
         chosen = goals[:, 2] < 2
         recorded = read_steps(episodes, rows, steps, BATCH.n_step)
-        rewarded = reward_by_goal(recorded.replace(desired_goal=goals, is_relabelled=chosen), chosen, test)
+        rewarded = reward_by_goal(recorded.replace(desired_goal=goals, is_relabelled=chosen), test)
         return transitions(rewarded, test.achieved_goal, TrainConfig(batch=BATCH), is_demonstration=False)
 
     arguments = (demonstrations(), jnp.array([0, 2, 2, 1]), jnp.array([1, 0, 1, 0]), jnp.array([[DEMO, 2.0, t] for t in range(4)]))

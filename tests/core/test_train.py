@@ -181,19 +181,19 @@ def test_reset_and_step_are_traced_once(data):
 
 def test_cloning_moves_the_actor_alone_and_its_average_follows(data):
     agent = dataclasses.replace(make_config().agent, learning_rate=1e-2, actor_average_span=0.02)
-    config = make_config(agent=agent, batch=BatchConfig(batch_size=32))
+    config = make_config(algo="bc", agent=agent, batch=BatchConfig(batch_size=32))
     start = train.init(jax.random.key(0), data, make_env(), config)
     run = functools.partial(train.clone, env=make_env(), config=config, num_iterations=300)
-    warm, metrics = jax.jit(run)(start, data)
-    chex.assert_tree_all_finite((warm.agent, metrics))
-    assert (int(warm.updates), int(warm.env_steps)) == (300, 0)
-    chex.assert_trees_all_equal(warm.agent.critics, start.agent.critics)
-    chex.assert_trees_all_equal(warm.replay, start.replay)
-    act = train.make_policy(actor_of(warm), make_env(), config)
+    cloned, metrics = jax.jit(run)(start, data)
+    chex.assert_tree_all_finite((cloned.agent, metrics))
+    assert (int(cloned.updates), int(cloned.env_steps)) == (300, 0)
+    chex.assert_trees_all_equal(cloned.agent.critics, start.agent.critics)
+    chex.assert_trees_all_equal(cloned.replay, start.replay)
+    act = train.make_policy(actor_of(cloned), make_env(), config)
     action = act(jax.random.key(0), data.demonstrations.observations[:, 0], data.demonstrations.desired_goals)
     np.testing.assert_allclose(action[:, 1], -0.5, atol=0.2)
-    chex.assert_trees_all_close(warm.agent.average_actor, warm.agent.actor, atol=0.1)  # it has followed
-    moved = jax.tree.map(lambda old, new: float(np.abs(old - new).max()), start.agent.average_actor, warm.agent.average_actor)
+    chex.assert_trees_all_close(cloned.agent.average_actor, cloned.agent.actor, atol=0.1)  # it has followed
+    moved = jax.tree.map(lambda old, new: float(np.abs(old - new).max()), start.agent.average_actor, cloned.agent.average_actor)
     assert max(jax.tree.leaves(moved)) > 0.1
 
 

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import chex
 import jax
@@ -75,19 +76,25 @@ def test_a_film_that_cannot_be_drawn_is_a_warning(saved, tmp_path, monkeypatch):
     assert hindrl.load_run(tmp_path).spec.seeds == (0,)
 
 
-def test_a_viewer_of_ones_own_that_fails_is_a_warning_of_one_line(saved, tmp_path, monkeypatch):
-    class Viewer:
-        def animation(self, env, states, captions=None):
-            return [state.no_such_field for state in states], []
-
-    monkeypatch.setattr(films, "viewer", lambda env: Viewer())
-    monkeypatch.setattr(films, "is_own", lambda env: True)
-    with pytest.warns(UserWarning, match=r"no episode\.gif: the viewer of .* fails \(AttributeError: .*no_such_field.*\): mend it"):
+@pytest.mark.parametrize(
+    ("animation", "said"),
+    [
+        (lambda states: ([state.no_such_field for state in states], []), "AttributeError: .*no_such_field"),
+        (lambda states: [np.zeros((8, 8, 3), np.uint8)] * len(states), "ValueError"),  # no seconds beside the pictures
+        (lambda states: (["no picture"] * len(states), [0.1] * len(states)), "Error: "),
+    ],
+)
+def test_a_viewer_of_ones_own_that_fails_is_a_warning_of_one_line(saved, tmp_path, monkeypatch, animation, said):
+    viewer = SimpleNamespace(animation=lambda env, states, captions=None: animation(states))
+    monkeypatch.setattr(films, "viewer", lambda env: viewer)
+    monkeypatch.setattr(films, "is_registered_by_user", lambda env: True)
+    with pytest.warns(UserWarning, match=rf"no episode\.gif: the viewer of .* fails \(.*{said}.*\): mend it"):
         hindrl.save_run(tmp_path / "run", saved[0])
     assert (tmp_path / "run" / "summary.json").exists()
-    monkeypatch.setattr(films, "is_own", lambda env: False)
-    with pytest.raises(AttributeError):  # one of ours is a bug, and says where
+    monkeypatch.setattr(films, "is_registered_by_user", lambda env: False)
+    with pytest.raises(Exception, match=said.partition(": ")[2]) as bug:  # one of ours is a bug, and says where
         hindrl.load_run(tmp_path / "run").render(tmp_path / "film.gif")
+    assert not isinstance(bug.value, hindrl.UserError)
 
 
 def test_damaged_parameters_are_refused(saved, tmp_path):

@@ -109,6 +109,7 @@ def test_viewer_may_be_an_object_or_the_name_of_a_module(forget, tmp_path):
     ("name", "message"),
     [
         ("two_rooms:Nope", "unknown environment 'Nope': two_rooms registers TwoRooms, by the `name` of the class; choose that"),
+        ("json:Nope", "unknown environment 'Nope', not even by 'json', which is to call hindrl_jax.register"),
         ("no_such_module:Nope", "there is no module 'no_such_module': start the command in the folder where it is"),
         ("FixedGridPickAndPlac", "did you mean 'FixedGridPickAndPlace'?"),
         ("Nope", "or MODULE:NAME for a task of your own"),
