@@ -1,5 +1,6 @@
 """`hindrl train --render-every`: episodes along a run. In process, with a run that is as short as can be."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import jax
@@ -56,6 +57,7 @@ def test_refusals(tmp_path, capsys, monkeypatch):
     out = tmp_path / "run"
     refused = refusal(capsys, *TRAIN, "--render-every", "0", "--out", out)
     assert "--render-every 0 is too few: give the number of steps between two films" in refused
-    monkeypatch.setattr(registry, "viewer", lambda env: None)
+    undrawn = dataclasses.replace(registry.TASKS["FixedGridPickAndPlace"], viewer=None)
+    monkeypatch.setitem(registry.TASKS, "FixedGridPickAndPlace", undrawn)
     assert "nothing draws FixedGridPickAndPlace" in refusal(capsys, *TRAIN, "--render-every", "30", "--out", out)
     assert not out.exists()
