@@ -43,14 +43,9 @@ CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
     ("layer_norm", lambda c: c.agent.critic_network is None, "critics of your own have layer normalisation or not: drop it"),
     ("layer_norm", lambda c: not c.agent.residual, "residual networks have layer normalisation of their own: set --no-residual"),
     (
-        "hindrl_sampling_strategy union_sampling_ratio intersection_goals",
+        "hindrl_sampling_strategy union_sampling_ratio intersection_goals bootstrap_past_relabelled_goals strict_goal_test",
         _relabels,
         "nothing is relabelled: choose --algo hindrl with --relabelled-per-original above 0",
-    ),
-    (
-        "bootstrap_past_relabelled_goals strict_goal_test",
-        _relabels,
-        "no goal is tested: choose --algo hindrl with --relabelled-per-original above 0",
     ),
     (
         "union_sampling_ratio",
@@ -78,11 +73,7 @@ CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
     ("bc_loss bc_action", lambda c: _clones(c) or c.imitation_proposal > 0, "nothing is cloned: raise --bc-weight"),
     ("epsilon_steps epsilon_deviations", lambda c: c.goal.epsilon is None, "epsilon itself is given: set it to None (--epsilon None)"),
     ("epsilon_deviations", lambda c: c.goal.epsilon_steps > 0, "epsilon depends on it only where pairs are some steps apart: add --epsilon-steps 5"),
-    (
-        "epsilon_steps epsilon_deviations epsilon",
-        _relabels,
-        "epsilon is used only for relabelling and the filter: choose --algo hindrl",
-    ),
+    ("epsilon_steps epsilon_deviations epsilon", _relabels, "epsilon is used only for relabelling and the filter: choose --algo hindrl"),
 )
 """The fields, the condition under which they have an effect, and what to do where it does not hold."""
 
