@@ -34,7 +34,7 @@ def main() -> None:
     demonstrations = hindrl_jax.load_demonstrations(arguments.demos, env=env)
     config = hindrl_jax.preset(arguments.algo, env=env)
     if config.learns_from_rollouts:
-        config = dataclasses.replace(config, steps=arguments.steps, eval_every=arguments.every)
+        config = dataclasses.replace(config, steps=arguments.steps, eval_every=arguments.every, imitation_steps=0)  # what is judged is what is learnt
     config = dataclasses.replace(config, action_hold=1, eval_episodes=config.num_envs)  # all evaluations are those below
     judge = episodes.Judge(BEGAN, arguments)
     seen = 0
@@ -44,7 +44,7 @@ def main() -> None:
         if len(result.rows) == seen:
             return
         seen = len(result.rows)
-        act = TrainedPolicy(env, config, jax.tree.map(lambda leaf: leaf[0], policy(result.state.agent, average=True)), None)
+        act = TrainedPolicy(env, config, jax.tree.map(lambda leaf: leaf[0], policy(result.state.agent, config, average=True)), None)
 
         def action(observation: dict[str, np.ndarray]) -> np.ndarray:
             seen_now = np.concatenate([observation["observation"], observation["achieved_goal"]])

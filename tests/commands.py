@@ -4,7 +4,7 @@ import pytest
 
 from hindrl_jax import cli
 
-SIZES = dict(num_envs=2, learning_starts=200, steps=260, eval_every=40, eval_episodes=3, updates_per_iteration=1, buffer_size=2000)
+SIZES = dict(num_envs=2, learning_starts=200, steps=260, eval_every=40, eval_episodes=3, updates_per_iteration=1, buffer_size=2000, imitation_steps=0)
 BATCH_SIZE, WIDTH = 16, 8
 TINY = [text for name, value in SIZES.items() for text in (f"--{name.replace('_', '-')}", str(value))]
 TINY += ["--batch-size", str(BATCH_SIZE), "--net-arch", str(WIDTH)]

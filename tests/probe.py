@@ -143,5 +143,5 @@ def values(state, observation, action, config=CONFIG):
 def mean_action(state, observation):
     """The mode of the actor, which is the same network in all of the agent's algorithms: (rows, 1)."""
     inputs = inputs_of(observation, CONFIG)
-    policy = agents.policy(state, average=False).replace(noise=0.0)
+    policy = agents.policy(state, CONFIG, average=False).replace(noise=0.0)
     return agents.select_action(jax.random.key(0), policy, inputs, CONFIG, action_dim=1)

@@ -23,7 +23,6 @@ from hindrl_jax.runs.writer import RunWriter
 from hindrl_jax.training.result import SOLVED, Row
 
 _TABLE_WIDTH = 92  # characters
-_ENOUGH_TO_IMITATE = 5  # demonstrations, from which on imitation alone has been seen to do better (docs/cables.md, docs/gymnasium.md)
 _GOOD = 0.8  # mean success of the returned policies from which on nobody needs advice
 
 
@@ -43,7 +42,7 @@ def train(arguments: list[str]) -> None:
         if writes:
             summary = writer.finish(result)
             print_table(_summary_table(summary, spec.config), least_width=_TABLE_WIDTH)
-            for line in said_of_never(summary["seeds"], result.rows):
+            for line in said_of_clones(summary["seeds"]) + said_of_never(summary["seeds"], result.rows):
                 console.print(line)
             console.print(speed_line(summary))
             console.print(f"wrote {out}: {', '.join(writer.files())}")
@@ -73,6 +72,13 @@ def _summary_table(summary: dict[str, Any], config: TrainConfig) -> Table:
     return table
 
 
+def said_of_clones(seeds: Sequence[Mapping[str, Any]]) -> list[str]:
+    """That some of the returned policies, those kept at step 0, are clones of the demonstrations, if they are; one line, or none."""
+    clones = [str(seed["seed"]) for seed in seeds if seed["returned_updates"] == 0]
+    which = "" if len(clones) == len(seeds) else f" of seed {', '.join(clones)}" if len(clones) == 1 else f" of seeds {', '.join(clones)}"
+    return [f"what was kept at step 0{which} is the clone of the demonstrations"] if clones else []
+
+
 def said_of_never(seeds: Sequence[Mapping[str, Any]], rows: Sequence[Row]) -> list[str]:
     """What "never" means where the returned policy is good all the same: the column counts mean actions, and sampled ones may solve more.
 
@@ -85,7 +91,8 @@ def said_of_never(seeds: Sequence[Mapping[str, Any]], rows: Sequence[Row]) -> li
     """
     reached: dict[int, str] = {}
     for seed in seeds:
-        if seed["updates_to_95"] is None and seed["returned_success"] >= SOLVED:
+        is_clone = seed["returned_updates"] == 0
+        if seed["updates_to_95"] is None and seed["returned_success"] >= SOLVED and not is_clone:
             own = [row for row in rows if row.seed == seed["seed"] and row.sampled_success is not None]
             first = next((row for row in own if row.sampled_success >= SOLVED), None)
             if own:
@@ -130,11 +137,7 @@ def _little_solved(spec: RunSpec, success: float, out: Path) -> list[str]:
     number = int(spec.demos) if is_number(spec.demos) else None
     more = "" if number is None else f" (--demos {number * (10 if number < 10 else 2)})"
     seeds = " and more seeds (--seeds 4)" if len(spec.seeds) == 1 else ""
-    imitation = ""
-    if spec.config.algo != "bc" and (number is None or number >= _ENOUGH_TO_IMITATE):
-        few = f", from {_ENOUGH_TO_IMITATE} demonstrations on" if number is None else ""
-        imitation = f"imitation alone, which takes less than a minute (--algo bc{few}); "
     return [
-        f"{success:.0%} of the episodes were solved. What may help: {imitation}a longer run (--steps {2 * spec.config.num_steps}){seeds};",
+        f"{success:.0%} of the episodes were solved. What may help: a longer run (--steps {2 * spec.config.num_steps}){seeds};",
         f"more demonstrations{more}, above all of starts where it fails: `hindrl render {shlex.quote(str(out))} --episodes 5` films five",
     ]

@@ -4,7 +4,7 @@
 own recipe; the thesis's settings and the original code's are presets (`hindrl_jax.tasks.presets`).
 """
 
-from hindrl_jax.config.agent import RESIDUAL_EXPANSION, AgentConfig
+from hindrl_jax.config.agent import IMITATION_NET_ARCH, RESIDUAL_EXPANSION, AgentConfig
 from hindrl_jax.config.batch import BatchConfig, Source, Strategy
 from hindrl_jax.config.conditions import without_effect
 from hindrl_jax.config.goal import GoalConfig
@@ -17,6 +17,7 @@ __all__ = [
     "Algorithm",
     "BatchConfig",
     "GoalConfig",
+    "IMITATION_NET_ARCH",
     "QuirksConfig",
     "RESIDUAL_EXPANSION",
     "SWEEPABLE",

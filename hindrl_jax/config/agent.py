@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Callable
 from typing import Any, Literal
@@ -10,6 +11,8 @@ from hindrl_jax.base.checks import check, check_types
 
 RESIDUAL_EXPANSION = 4
 """Width inside a residual block, over that of the block."""
+IMITATION_NET_ARCH = (256, 256)
+"""Two wide layers imitate better than four narrow ones, and sooner (docs/cables.md)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,6 +101,14 @@ class AgentConfig:
             raise ValueError(f"residual adds up layers of equal widths, but net_arch = {self.net_arch}: give equal ones, or turn residual off")
         if self.q_filter == "smooth" and self.num_critics < 2:
             raise ValueError("q_filter = smooth compares the critics' values with each other, but num_critics = 1: raise it, or choose hard")
+
+    @property
+    def for_imitation(self) -> AgentConfig:
+        """The same with the network of bc; not checked, since other values may be traced."""
+        agent = copy.copy(self)
+        object.__setattr__(agent, "net_arch", IMITATION_NET_ARCH)
+        object.__setattr__(agent, "residual", False)
+        return agent
 
     @property
     def widest_layer(self) -> int:

@@ -20,7 +20,7 @@ def _has_demo_rows(config: TrainConfig) -> bool:
 
 
 def _clones(config: TrainConfig) -> bool:
-    """Whether cloning is ever part of the loss; an `imitation_proposal` clones by itself."""
+    """Whether cloning is ever part of the loss; a policy that `imitation_steps` make clones by itself."""
     return not config.learns_from_rollouts or config.agent.bc_weight > 0.0
 
 
@@ -66,11 +66,11 @@ CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
     ("bc_weight q_filter", _has_demo_rows, "the batch has no demonstration rows to clone: raise --max-demo-ratio"),
     (
         "bc_loss bc_action unscaled_demo_actions",
-        lambda c: _has_demo_rows(c) or c.imitation_proposal > 0,
+        lambda c: _has_demo_rows(c) or c.imitation_steps > 0,
         "the batch has no demonstration rows to clone: raise --max-demo-ratio",
     ),
     ("q_filter", _clones, "nothing is cloned: raise --bc-weight"),
-    ("bc_loss bc_action", lambda c: _clones(c) or c.imitation_proposal > 0, "nothing is cloned: raise --bc-weight"),
+    ("bc_loss bc_action", lambda c: _clones(c) or c.imitation_steps > 0, "nothing is cloned: raise --bc-weight"),
     ("epsilon_steps epsilon_deviations", lambda c: c.goal.epsilon is None, "epsilon itself is given: set it to None (--epsilon None)"),
     ("epsilon_deviations", lambda c: c.goal.epsilon_steps > 0, "epsilon depends on it only where pairs are some steps apart: add --epsilon-steps 5"),
     ("epsilon_steps epsilon_deviations epsilon", _relabels, "epsilon is used only for relabelling and the filter: choose --algo hindrl"),

@@ -48,9 +48,12 @@ class TrainConfig:
     demo_reset_curriculum: bool = False
     """Those states are near the end of each demonstration at first, and move towards its beginning where episodes succeed from them three times in a
     row: the reverse curriculum of RFCL (Tao et al., 2024)."""
-    imitation_proposal: int = 0
-    """Gradient steps of behaviour cloning that make a second policy, frozen, which proposes an action beside the actor's: whichever the target
-    critics value more is taken, in episodes, evaluations and targets (IBRL, Hu et al., 2024). 0 for no such policy."""
+    imitation_steps: int = 0
+    """Gradient steps of behaviour cloning at the start, which make a second policy, with the network of bc. It is one of those that may be returned;
+    reinforcement learning begins and goes on without it. 0 for no such policy."""
+    imitation_proposal: bool = False
+    """That policy proposes an action beside the actor's: whichever the target critics value more is taken, in episodes, evaluations and targets
+    (IBRL, Hu et al., 2024)."""
     buffer_size: int = 500_000
     """Transitions that the replay holds."""
     stop_at: float | None = None
@@ -77,7 +80,7 @@ class TrainConfig:
             stop_at=(self.stop_at is None or 0.0 < self.stop_at <= 1.0, "greater than 0 and at most 1, or None"),
             learning_starts=(self.learning_starts >= 0, "0 or more"),
             demo_reset_ratio=(0.0 <= self.demo_reset_ratio <= 1.0, "between 0 and 1"),
-            imitation_proposal=(self.imitation_proposal >= 0, "0 or more"),
+            imitation_steps=(0 <= self.imitation_steps <= LARGEST, f"between 0 and {LARGEST}"),
         )
         steps = self.num_steps if self.learns_from_rollouts else 0
         updates = self.num_updates * (steps // self.steps_per_iteration + 1) if self.learns_from_rollouts else self.num_steps
@@ -89,9 +92,11 @@ class TrainConfig:
             raise ValueError(f"demo_reset_curriculum = {self.demo_reset_curriculum} is of no use while demo_reset_ratio = 0: raise that, too")
         if self.action_chunks and self.action_hold == 1:
             raise ValueError("action_chunks = True is of no use while action_hold = 1: raise that, too, or set it to None")
+        if self.imitation_proposal and self.imitation_steps == 0:
+            raise ValueError("imitation_proposal = True is of no use while imitation_steps = 0: raise that, too")
         if self.algo == "bc":
             given: dict[str, Any] = {
-                "imitation_proposal": self.imitation_proposal,
+                "imitation_steps": self.imitation_steps,
                 "q_filter": self.agent.q_filter != "off" and self.agent.q_filter,
                 "base": self.agent.base != "tqc" and self.agent.base,
             }

@@ -48,7 +48,7 @@ class AgentState(struct.PyTreeNode, kw_only=True):
     average_actor: Params  # running average of the actor, which acts more steadily
     critics: Params  # leaves (C, ...)
     target_critics: Params  # leaves (C, ...)
-    imitation: Params | None  # a clone of the demonstrations, frozen, that proposes actions beside the actor; None where none does
+    imitation: Params | None  # of a policy cloned at the start, then frozen, see `TrainConfig.imitation_steps`; None where there is none
     log_alpha: Array  # ()
     actor_optimiser: optax.OptState
     critic_optimiser: optax.OptState
@@ -59,7 +59,7 @@ class AgentState(struct.PyTreeNode, kw_only=True):
 class Policy(struct.PyTreeNode, kw_only=True):
     """What acting needs."""
 
-    actor: Params  # with `imitation_proposal` a dict of the actor, the imitation and the critics that choose between the two
+    actor: Params  # with `imitation_steps` what `policy` makes of two networks
     scale: InputScale
     noise: Array  # () of its actions, before tanh, over the standard deviation that the actor gives them: 0 for the mean action, 1 for sampled ones
 
@@ -70,13 +70,16 @@ def init(key: Array, scale: InputScale, config: TrainConfig, *, action_dim: int)
     input_dim = network_inputs(scale.observation, scale.goal, scale.goal, scale, config).shape[-1]
     actor = init_actor(key_actor, config.agent, input_dim=input_dim, action_dim=action_dim)
     critics = init_critics(key_critics, config.agent, input_dim=input_dim, action_dim=action_dim)
+    imitation = None
+    if config.imitation_steps > 0:
+        imitation = init_actor(jax.random.fold_in(key, 2), config.agent.for_imitation, input_dim=input_dim, action_dim=action_dim)
     log_alpha = jnp.log(jnp.asarray(config.agent.initial_alpha, jnp.float32))
     return AgentState(
         actor=actor,
         average_actor=jax.tree.map(jnp.copy, actor),
         critics=critics,
         target_critics=jax.tree.map(jnp.copy, critics),
-        imitation=jax.tree.map(jnp.copy, actor) if config.imitation_proposal > 0 else None,
+        imitation=imitation,
         log_alpha=log_alpha,
         actor_optimiser=_ADAM.init(actor),
         critic_optimiser=_ADAM.init(critics),
@@ -85,25 +88,32 @@ def init(key: Array, scale: InputScale, config: TrainConfig, *, action_dim: int)
     )
 
 
-def policy(state: AgentState, *, average: bool) -> Policy:
-    """The policy that explores, or with `average` the mean actions of the steadier one that is evaluated and saved. Leaves (..., ) as the state's."""
+def policy(state: AgentState, config: TrainConfig, *, average: bool, imitates: bool = False) -> Policy:
+    """The policy that explores, or with `average` the mean actions of the steadier one that is evaluated and saved. Leaves (..., ) as the state's.
+
+    With `imitation_steps` the latter is a dict of the actor, the imitation, and whether it is the imitation that acts, as it does with `imitates`;
+    so these policies have equal structures, and are kept, chosen from and saved alike. With `imitation_proposal` both are, and the dict has the
+    critics, too, which choose between the two.
+    """
     actor = state.average_actor if average else state.actor
-    if state.imitation is not None:
-        actor = {"actor": actor, "imitation": state.imitation, "critics": state.target_critics}
     noise = jnp.zeros_like(state.log_alpha) if average else jnp.ones_like(state.log_alpha)
+    if state.imitation is not None and (average or config.imitation_proposal):
+        actor = {"actor": actor, "imitation": state.imitation, "imitates": jnp.full(noise.shape, imitates, jnp.int32)}
+        if config.imitation_proposal:
+            actor["critics"] = state.target_critics
     return Policy(actor=actor, scale=state.scale, noise=noise)
 
 
 def select_action(key: Array, policy: Policy, inputs: Array, config: TrainConfig, *, action_dim: int) -> Array:
-    """Actions (B, A) in [-1, 1] at inputs (B, input_dim), see `inputs.network_inputs`, with the policy's noise.
-
-    With `imitation_proposal` the critics choose, see `Policy.actor`.
-    """
-    proposes = config.imitation_proposal > 0
-    distribution = apply_actor(policy.actor["actor"] if proposes else policy.actor, inputs.T, config.agent, action_dim=action_dim)
+    """Actions (B, A) in [-1, 1] at inputs (B, input_dim), see `inputs.network_inputs`, with the policy's noise; an imitation's are mean actions."""
+    imitation = policy.actor.get("imitation")
+    distribution = apply_actor(policy.actor if imitation is None else policy.actor["actor"], inputs.T, config.agent, action_dim=action_dim)
     action, _ = distribution.at(policy.noise * jax.random.normal(key, distribution.mean.shape))
-    if proposes:
-        action, _ = _better(action, policy.actor["imitation"], policy.actor["critics"], inputs.T, config)
+    if imitation is not None:
+        imitated = apply_actor(imitation, inputs.T, config.agent.for_imitation, action_dim=action_dim).mode
+        if config.imitation_proposal:
+            action, _ = _better((action, imitated), policy.actor["critics"], inputs.T, config)
+        action = jnp.where(policy.actor["imitates"], imitated, action)
     return action.T
 
 
@@ -182,8 +192,9 @@ def _targets(state: AgentState, target_critics: Params, config: TrainConfig, blo
     """What the critics of each column are moved towards: (M, B) target atoms, or (1, B) without quantiles."""
     next_action, log_prob = apply_actor(state.actor, block.next_inputs, config.agent, action_dim=block.action.shape[0]).at(block.next_noise)
     entropy_bonus = jnp.zeros_like(log_prob) if config.agent.relative_value else -jnp.exp(state.log_alpha) * log_prob
-    if state.imitation is not None:
-        next_action, is_own = _better(next_action, state.imitation, target_critics, block.next_inputs, config)
+    if config.imitation_proposal:
+        imitated = apply_actor(state.imitation, block.next_inputs, config.agent.for_imitation, action_dim=next_action.shape[0]).mode
+        next_action, is_own = _better((next_action, imitated), target_critics, block.next_inputs, config)
         entropy_bonus = jnp.where(is_own, entropy_bonus, 0.0)  # the imitating policy is not random
     next_atoms = apply_critics(target_critics, block.next_inputs, next_action, config.agent)  # (C, Q, B)
     bellman = dict(reward=block.reward, discount=block.discount, entropy_bonus=entropy_bonus)
@@ -195,9 +206,8 @@ def _targets(state: AgentState, target_critics: Params, config: TrainConfig, blo
     return jnp.clip(targets, 0.0, 1.0) if config.agent.clip_targets else targets
 
 
-def _better(own: Array, imitation: Params, critics: Params, inputs: Array, config: TrainConfig) -> tuple[Array, Array]:
-    """Of the actor's actions (A, B) and the imitating policy's mean ones those that the critics value more, see `comparison.better`."""
-    actions = own, apply_actor(imitation, inputs, config.agent, action_dim=own.shape[0]).mode
+def _better(actions: tuple[Array, Array], critics: Params, inputs: Array, config: TrainConfig) -> tuple[Array, Array]:
+    """Of two actions (A, B) those that the critics value more, see `comparison.better`."""
     return better(actions, (_value(critics, inputs, actions[0], config), _value(critics, inputs, actions[1], config)))
 
 
@@ -303,6 +313,11 @@ def _step_actor(state: AgentState, gradient: Params, schedule: Schedule, config:
         actor_optimiser=actor_optimiser,
         average_actor=optax.incremental_update(actor, state.average_actor, schedule.actor_average_rate),
     )
+
+
+def with_actor(state: AgentState, actor: Params) -> AgentState:
+    """The agent with another actor, whose optimiser begins anew."""
+    return state.replace(actor=actor, average_actor=actor, actor_optimiser=_ADAM.init(actor))
 
 
 def update_bc(key: Array, state: AgentState, batch: Transition, schedule: Schedule, config: TrainConfig) -> tuple[AgentState, Metrics]:

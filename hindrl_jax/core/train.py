@@ -6,6 +6,7 @@ over its gradient steps.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import cast
 
 import jax
@@ -27,6 +28,8 @@ from hindrl_jax.core.inputs import network_inputs
 from hindrl_jax.core.replay import RecordedStep, ReplayState
 from hindrl_jax.core.rollout import Act, DemoResets, Evaluation, RolloutState
 from hindrl_jax.core.schedules import schedule
+
+_IMITATION = 2**16  # the random numbers of `imitate` are none of those that a state's key gives when it is split
 
 
 class TrainState(struct.PyTreeNode, kw_only=True):
@@ -162,7 +165,7 @@ def learn(state: TrainState, guidance: Guidance, *, env: Steppable, config: Trai
 
     def iteration(state: TrainState, _: None) -> tuple[TrainState, Metrics]:
         key, key_interact, key_batch, key_updates = jax.random.split(state.key, 4)
-        act = make_policy(agents.policy(state.agent, average=False), env, config)
+        act = make_policy(agents.policy(state.agent, config, average=False), env, config)
         state = _interact(key_interact, state.replace(key=key), guidance, env, config, act)
         return gradient_steps(key_updates, state, draw_batches(key_batch, state, guidance, env, config), env, config)
 
@@ -211,10 +214,15 @@ def clone(state: TrainState, guidance: Guidance, *, env: Environment, config: Tr
 
 
 def imitate(state: TrainState, guidance: Guidance, *, env: Environment, config: TrainConfig) -> TrainState:
-    """Clones the policy that proposes actions beside the actor, by `imitation_proposal` gradient steps; all else stays as it is."""
-    key, key_clone = jax.random.split(state.key)
-    clone_of, _ = clone(state.replace(key=key_clone), guidance, env=env, config=config, num_iterations=config.imitation_proposal)
-    return state.replace(key=key, agent=state.agent.replace(imitation=clone_of.agent.actor))
+    """Clones a second policy by `imitation_steps` gradient steps; all else stays as it is, and so does what follows."""
+    cloning = dataclasses.replace(config, agent=config.agent.for_imitation)
+    start = state.replace(
+        agent=agents.with_actor(state.agent, state.agent.imitation),
+        key=jax.random.fold_in(state.key, _IMITATION),
+        updates=jnp.zeros_like(state.updates),
+    )
+    cloned, _ = clone(start, guidance, env=env, config=cloning, num_iterations=config.imitation_steps)
+    return state.replace(agent=state.agent.replace(imitation=cloned.agent.average_actor))
 
 
 def evaluate(key: Array, policy: Policy, guidance: Guidance, *, env: Steppable, config: TrainConfig, num_episodes: int) -> Evaluation:

@@ -135,7 +135,7 @@ OPTIONS: tuple[Option, ...] = (
         "imitation-proposal",
         "demonstrations",
         "a policy cloned by 2,000 gradient steps proposes beside the actor, and the critics choose (IBRL)",
-        (("imitation_proposal", 2_000),),
+        (("imitation_steps", 2_000), ("imitation_proposal", True)),
     ),
     Option("bc-norm", "demonstrations", "cloning loss is the distance, not its square (original code)", (("quirks.bc_loss", "norm"),)),
     Option("bc-sample", "demonstrations", "cloning loss of a sampled action, not of the mean one (original code)", (("quirks.bc_action", "sample"),)),

@@ -174,8 +174,11 @@ def numpy_form(trained: TrainedPolicy) -> tuple[dict[str, np.ndarray], dict[str,
       UserError: if the policy is made of what NumPy has no form of here.
     """
     env, config = trained.env, trained.config
+    actor, agent = trained.policy.actor, config.agent
+    if "imitates" in actor:  # one of two networks
+        actor, agent = (actor["imitation"], config.agent.for_imitation) if actor["imitates"] else (actor["actor"], agent)
     unusual = {
-        "imitation_proposal": config.imitation_proposal > 0,
+        "imitation_proposal": config.imitation_proposal,
         "achieved_goal_input": config.quirks.achieved_goal_input,
         "actor_network": config.agent.actor_network is not None,
     }
@@ -186,8 +189,8 @@ def numpy_form(trained: TrainedPolicy) -> tuple[dict[str, np.ndarray], dict[str,
         "format": FORMAT,
         "task": env.name,
         "encoding": config.agent.input_encoding,
-        "depth": len(config.agent.net_arch),
-        "residual": config.agent.residual,
+        "depth": len(agent.net_arch),
+        "residual": agent.residual,
         "achieved": _entries_of_achieved_goal(env) if config.relative_goals else None,
         "action_hold": trained.action_hold,
         "chunks": trained.chunks,
@@ -197,7 +200,7 @@ def numpy_form(trained: TrainedPolicy) -> tuple[dict[str, np.ndarray], dict[str,
     scale = trained.policy.scale
     low, high = (np.broadcast_to(bound, (env.action_dim,)) for bound in (env.action_low, env.action_high))
     arrays = {
-        **flatten_dict(trained.policy.actor["params"], sep="/"),
+        **flatten_dict(actor["params"], sep="/"),
         "observation_scale": scale.observation,
         "observation_centre": scale.observation_centre,
         "goal_scale": scale.goal,

@@ -81,6 +81,7 @@ class Checkpoints:
             "rows": [dataclasses.asdict(row) for row in result.rows],
             "chunks": [{name: [float(value) for value in values] for name, values in chunk.items()} for chunk in result.chunks],
             "evaluation_steps": [] if result.evaluation_steps is None else result.evaluation_steps.tolist(),
+            "cloned_success": None if result.cloned_success is None else result.cloned_success.tolist(),
             **{name: getattr(result, name) for name in _COUNTERS},
         }
         path = self.folder / str(result.steps_done)
@@ -124,6 +125,7 @@ class Checkpoints:
                 key=key,
                 kept=kept,
                 evaluation_steps=np.asarray(progress["evaluation_steps"], np.int64) if progress["rows"] else None,
+                cloned_success=None if progress.get("cloned_success") is None else np.asarray(progress["cloned_success"]),
                 rows=[Row(**row) for row in progress["rows"]],
                 chunks=[{name: np.asarray(values, np.float32) for name, values in chunk.items()} for chunk in progress["chunks"]],
                 **{name: progress[name] for name in _COUNTERS},

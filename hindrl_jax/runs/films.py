@@ -67,4 +67,4 @@ def _run_of(result: Result, index: int, path: Path) -> Run:
     learnt = (result.state.agent, result.guidance.behavioural_goals)
     agent, goals = jax.tree.map(lambda leaf: jnp.asarray(jax.device_get(leaf[index : index + 1])), learnt)  # on one device
     spec = RunSpec(env=result.env, config=result.configs[index], demos=FROM_PYTHON, seeds=(result.seeds[index],))
-    return Run(path=path, spec=spec, policies=policy(agent, average=True), behavioural_goals=goals)
+    return Run(path=path, spec=spec, policies=policy(agent, spec.config, average=True), behavioural_goals=goals)

@@ -307,7 +307,7 @@ def _shapes_of(spec: RunSpec) -> tuple[Policy, GoalTable, Params]:
 
     def fresh(key: jax.Array, scale: InputScale) -> tuple[Policy, Params]:
         agent = init(key, scale, spec.config, action_dim=env.action_dim)
-        return policy(agent, average=True), agent.critics
+        return policy(agent, spec.config, average=True), agent.critics
 
     of_one = jax.eval_shape(fresh, jax.random.key(0), InputScale(**vectors))
     policies, critics = jax.tree.map(lambda leaf: _Shape((num_seeds, *leaf.shape)), of_one)

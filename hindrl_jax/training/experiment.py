@@ -98,7 +98,7 @@ def fit(
         report.wait("compiling")
     started = time.perf_counter()
     with contextlib.closing(programs_of(hold(env, num_held, chunks=config.action_chunks), configs, tables)) as programs:
-        kept = nothing_kept(policy(programs.shapes["state"].agent, average=True).actor)
+        kept = nothing_kept(policy(programs.shapes["state"].agent, config, average=True).actor)
         result = Result(env=env, configs=configs, seeds=tuple(seeds), **programs.shapes, kept=kept, rows=[], compile_seconds=0.0)
         restored = restore(result)
         seeds_on_devices, tables = spread((np.asarray(seeds, np.uint32), tables), programs.mesh)
@@ -136,12 +136,12 @@ def _train(result: Result, programs: Programs, report: Report) -> None:
     """Takes the experiment from where it is to its end, all but the last report."""
     config, begins = result.config, result.steps_done == 0
     started = time.perf_counter() - result.train_seconds
-    if begins and config.learns_from_rollouts:
+    if begins and config.imitation_steps > 0:
+        _imitate(result, programs, started)
+    ends = result.kept.all_confirmed
+    if begins and config.learns_from_rollouts and not ends:
         result.state = jax.block_until_ready(programs.collect(result.state, result.guidance))
         result.env_steps = programs.steps_at_random
-        if config.imitation_proposal > 0:
-            result.state = jax.block_until_ready(programs.imitate(result.state, result.guidance))
-    ends = result.kept.all_confirmed
     while result.steps_done < config.num_steps and not ends:
         result.state, metrics = programs.learn(result.state, result.guidance)
         result.chunks.append(gather(metrics))
@@ -163,9 +163,19 @@ def _train(result: Result, programs: Programs, report: Report) -> None:
     _finish(result, programs)
 
 
+def _imitate(result: Result, programs: Programs, started: float) -> None:
+    """Clones the demonstrations. What comes of it is the first policy that is kept."""
+    result.state = programs.imitate(result.state, result.guidance)
+    clones = policy(result.state.agent, result.config, average=True, imitates=True)
+    evaluation = _played(result, programs, clones, result.config.eval_episodes)
+    result.cloned_success = np.asarray(evaluation.success).mean(axis=1)
+    result.train_seconds = time.perf_counter() - started
+    _keep(result, programs, clones, np.zeros(len(result.seeds)), evaluation)
+
+
 def _evaluate(result: Result, programs: Programs, started: float) -> None:
     """Evaluates the present policies, notes it, and keeps those that are good."""
-    present, stop_at, num_episodes = policy(result.state.agent, average=True), result.config.stop_at, result.config.eval_episodes
+    present, num_episodes = policy(result.state.agent, result.config, average=True), result.config.eval_episodes
     noise: Any = np.zeros(len(result.seeds))
     evaluation = by_mean = _played(result, programs, present, num_episodes)
     averaged = {name: np.mean([chunk[name] for chunk in result.chunks], axis=0) for name in result.chunks[0]} if result.chunks else {}
@@ -176,13 +186,18 @@ def _evaluate(result: Result, programs: Programs, started: float) -> None:
     result.train_seconds = time.perf_counter() - started
     result.rows += _rows(result, by_mean, averaged)
     result.chunks.clear()
-    confirmed = np.zeros(len(result.seeds), bool)
+    _keep(result, programs, present, noise, evaluation)
+
+
+def _keep(result: Result, programs: Programs, policies: Policy, noise: np.ndarray, evaluation: Evaluation) -> None:
+    """Keeps what is good of policies that were evaluated with some noise, and confirms those with which a run may end."""
+    confirmed, stop_at = np.zeros(len(result.seeds), bool), result.config.stop_at
     if stop_at is not None:
         confirmed = (np.asarray(evaluation.success).mean(axis=1) >= stop_at) & (result.kept.confirmed < 0)
         if confirmed.any():
-            again = _played(result, programs, _with_noise(present, noise, programs), FRESH_EPISODES)
+            again = _played(result, programs, _with_noise(policies, noise, programs), FRESH_EPISODES)
             confirmed &= np.asarray(again.success).mean(axis=1) >= stop_at
-    result.kept = keep(result.kept, Trial(gather(present.actor), noise, evaluation), confirmed, result.moment)
+    result.kept = keep(result.kept, Trial(gather(policies.actor), noise, evaluation), confirmed, result.moment)
 
 
 def _with_noise(policies: Policy, noise: np.ndarray, programs: Programs) -> Policy:
@@ -191,7 +206,7 @@ def _with_noise(policies: Policy, noise: np.ndarray, programs: Programs) -> Poli
 
 def _finish(result: Result, programs: Programs) -> None:
     """Chooses the policies that are returned."""
-    scale, last_policy = result.state.agent.scale, policy(result.state.agent, average=True)
+    scale, last_policy = result.state.agent.scale, policy(result.state.agent, result.config, average=True)
 
     def play(actor: Any, noise: np.ndarray) -> Evaluation:
         of_runs: dict[str, Any] = spread(dict(actor=actor, noise=noise.astype(np.float32)), programs.mesh)

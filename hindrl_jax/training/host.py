@@ -83,7 +83,7 @@ class HostPrograms(Programs):
             if not config.learns_from_rollouts:
                 pending["clone"] = compile_(self._trace(training.clone, state, *rest, donate=True, num_iterations=self.chunk))
             else:
-                planning = (state.key, policy(state.agent, average=False), state.rollout, values)
+                planning = (state.key, policy(state.agent, config, average=False), state.rollout, values)
                 deciding = self._trace(decide, *planning, at_random=False)
                 _, plan = shapes_on(deciding.out_info, self.mesh)
                 step = shapes_on(_time_step_shapes(self._shape, env.observation_dim), self.mesh)
@@ -91,7 +91,7 @@ class HostPrograms(Programs):
                 pending["remember"] = compile_(self._trace(remember, state, plan, (step, begun), *rest, donate=True))
                 pending["decide"] = compile_(deciding)
                 pending["decide_at_random"] = compile_(self._trace(decide, *planning, at_random=True))
-            if config.imitation_proposal > 0:
+            if config.imitation_steps > 0:
                 pending["imitate"] = compile_(self._trace(training.imitate, state, *rest, donate=True))
             self._programs = {name: program.result() for name, program in pending.items()}
 
@@ -130,7 +130,7 @@ class HostPrograms(Programs):
         return both[:, 0], evaluate(both[:, 1], stepper, self._policies, policy, num_episodes)
 
     def _planned(self, state: TrainState, *, at_random: bool) -> tuple[TrainState, Plan]:
-        explorer = policy(state.agent, average=False)
+        explorer = policy(state.agent, self.config, average=False)
         key, plan = self._programs["decide_at_random" if at_random else "decide"](state.key, explorer, state.rollout, self.values)
         return state.replace(key=key), plan
 

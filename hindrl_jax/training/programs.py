@@ -85,7 +85,7 @@ class Programs(abc.ABC):
 
     @abc.abstractmethod
     def imitate(self, state: TrainState, guidance: Guidance) -> TrainState:
-        """Clones the policy that proposes beside the actor, see `imitation_proposal`; the state is donated."""
+        """Clones a second policy, see `imitation_steps`; the state is donated."""
 
     @abc.abstractmethod
     def learn(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, Metrics]:
@@ -147,7 +147,7 @@ class JaxPrograms(Programs):
         config = self.config
         with self._compiler() as compile_:
             starting, guidance, state, key = self._trace_start(start, *given, None, values)
-            actor, rest = policy(state.agent, average=True), (guidance, values)
+            actor, rest = policy(state.agent, config, average=True), (guidance, values)
             function = training.learn if config.learns_from_rollouts else training.clone
             pending = {"learn": compile_(self._trace(function, state, *rest, donate=True, num_iterations=self.chunk))}
             pending["start"] = compile_(starting, **_RUN_ONCE)
@@ -155,7 +155,7 @@ class JaxPrograms(Programs):
                 pending[f"evaluate {num_episodes}"] = compile_(self._trace(evaluate, key, actor, *rest, num_episodes=num_episodes))
             if config.learns_from_rollouts:
                 pending["collect"] = compile_(self._trace(training.collect, state, *rest, donate=True, num_iterations=self.warm_up), **_RUN_ONCE)
-            if config.imitation_proposal > 0:
+            if config.imitation_steps > 0:
                 pending["imitate"] = compile_(self._trace(training.imitate, state, *rest, donate=True))
             self._programs = {name: program.result() for name, program in pending.items()}
 

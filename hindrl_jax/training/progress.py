@@ -39,6 +39,7 @@ class ProgressBar:
         self._rows_seen: int | None = None
         self._lines_said = 0
         self._last_is_said = True  # whether the newest evaluation has a line
+        self._clone_is_said = False
 
     @property
     def is_watched(self) -> bool:
@@ -50,6 +51,10 @@ class ProgressBar:
         tenths = math.floor(self._lines * result.steps_done / result.config.num_steps)
         if self._rows_seen is None or len(result.rows) < self._rows_seen:  # a training begins, or goes on after an interruption
             self._began, self._rows_seen, self._lines_said, self._last_is_said = None, len(result.rows), tenths, True
+            self._clone_is_said = False
+        if result.cloned_success is not None and not self._clone_is_said:
+            self._clone_is_said = True
+            self.say(clone_line(result.cloned_success))
         if len(result.rows) > self._rows_seen:
             self._rows_seen, self._last_is_said = len(result.rows), tenths > self._lines_said
             if self._last_is_said:
@@ -142,6 +147,12 @@ def bar(result: Result, began: tuple[int, float] | None, *, width: int, unicode:
     full = round(length * done / total)
     glyph, rest = "━─" if unicode else "#."
     return Text.assemble((glyph * full, "cyan"), (rest * (length - full), "bright_black"), words)
+
+
+def clone_line(success: np.ndarray) -> str:
+    """One line on the policies (S,) that were cloned at the start."""
+    spread = f" (worst {success.min():.0%})" if len(success) > 1 else ""
+    return f"a clone of the demonstrations solves {success.mean():.0%}{spread}; it is returned if nothing better is learnt"
 
 
 def evaluation_line(rows: Sequence[Row]) -> str:

@@ -66,6 +66,9 @@ class SeedSummary:
     """Wall-clock time of the whole run, all its seeds side by side."""
     episode_length: float
     """Mean length of the 100 fresh episodes of the last policy."""
+    cloned_success: float | None
+    """Share of an evaluation's episodes that the policy cloned at the start solves (`TrainConfig.imitation_steps`); None where there is none. Where
+    that one is returned, `returned_env_steps` is 0."""
     evaluation_steps: int
     """Environment steps that evaluations and the choice of the returned policy took; `env_steps` does not count them."""
 
@@ -96,6 +99,8 @@ class Result:
     """Gradient steps of each run so far."""
     evaluation_steps: np.ndarray | None = None
     """(S,) int, environment steps that evaluations took so far; None before the first."""
+    cloned_success: np.ndarray | None = None
+    """(S,) share of an evaluation's episodes that the policies cloned at the start solve; None where there are none."""
     returned: Returned | None = None
     """The best policy of each run; None while the experiment is under way."""
     final_success: np.ndarray | None = None
@@ -152,6 +157,7 @@ class Result:
             rows=self.rows_of(runs),
             kept=jax.tree.map(lambda leaf: leaf[runs], self.kept),
             returned=jax.tree.map(lambda leaf: leaf[runs], self.returned),
+            cloned_success=None if self.cloned_success is None else self.cloned_success[runs],
             evaluation_steps=self.evaluation_steps[runs],
             final_success=self.final_success[runs],
             final_length=self.final_length[runs],
@@ -173,5 +179,6 @@ class Result:
             updates_to_95=None if first is None else first.updates,
             seconds_to_95=None if first is None else first.seconds,
             episode_length=float(self.final_length[index]),
+            cloned_success=None if self.cloned_success is None else float(self.cloned_success[index]),
             evaluation_steps=int(self.evaluation_steps[index]),
         )

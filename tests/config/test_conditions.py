@@ -69,7 +69,8 @@ VALUES = {
     "learning_starts": (30, 20),
     "demo_reset_ratio": (0.5, 0.25),
     "demo_reset_curriculum": (True, False),
-    "imitation_proposal": (2, 3),
+    "imitation_steps": (2, 3),
+    "imitation_proposal": (True, False),
     "buffer_size": (60, 40),
     "batch_size": (16, 8),
     "max_demo_ratio": (0.5, 0.25),
@@ -177,7 +178,7 @@ BASES = {
         "the other joint_intersection": dict(hindrl_sampling_strategy="joint_intersection", intersection_goals="demonstrations"),
         "no relabelling": dict(relabelled_per_original=0.0, final_target_entropy=None),
         "no demonstration rows": dict(max_demo_ratio=0.0),
-        "no demonstration rows, proposals of a clone": dict(max_demo_ratio=0.0, imitation_proposal=1),
+        "no demonstration rows, proposals of a clone": dict(max_demo_ratio=0.0, imitation_steps=1, imitation_proposal=True),
         "networks of one's own": dict(actor_network=Tanh, critic_network=Tanh),
         "no cloning": dict(bc_weight=0.0),
     }.items()

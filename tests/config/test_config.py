@@ -127,7 +127,8 @@ BAD = [
     (TrainConfig, "action_hold", [0, -1, 2.5]),
     (TrainConfig, "stop_at", [0.0, -0.1, 1.01]),
     (TrainConfig, "demo_reset_curriculum", [0.5, True]),  # True without resets to demonstrated states
-    (TrainConfig, "imitation_proposal", [-1, True]),
+    (TrainConfig, "imitation_steps", [-1, True, 2**31]),
+    (TrainConfig, "imitation_proposal", [1, True]),  # True without a policy that could propose
     (TrainConfig, "action_chunks", [1, None]),
     (TrainConfig, "buffer_size", [0, 1e6]),
     (TrainConfig, "eval_every", [0]),
@@ -188,7 +189,7 @@ def test_the_algorithm_must_fit_its_settings(fitting, contradiction, name):
 @pytest.mark.parametrize(
     "changes",
     [
-        dict(imitation_proposal=1),
+        dict(imitation_steps=1),
         dict(agent=AgentConfig(q_filter="hard")),
         dict(agent=AgentConfig(base="sac")),
     ],
@@ -230,7 +231,7 @@ def test_sources_of_relabelled_goals_by_hand(changes, sources):
         ({"batch": {"hindrl_sampling_strategy": "joint_union"}}, "union_sampling_ratio", None),
         ({"batch": {"relabelled_per_original": 0.0}}, "hindrl_sampling_strategy", "nothing is relabelled"),
         ({"batch": {"max_demo_ratio": 0.0}}, "bc_loss", "no demonstration rows to clone"),
-        ({"batch": {"max_demo_ratio": 0.0}, "imitation_proposal": 1}, "bc_loss", None),
+        ({"batch": {"max_demo_ratio": 0.0}, "imitation_steps": 1}, "bc_loss", None),
         ({"agent": {"bc_weight": 0.0}}, "bc_action", "nothing is cloned"),
         ({"algo": "bc"}, "bc_action", None),
         ({}, "learning_rate", None),

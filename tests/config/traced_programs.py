@@ -46,10 +46,10 @@ class Stages:
         return train.imitate(state, data, **self.given(values)), data
 
     def clone(self, values, state, data):
-        return agent.policy(train.clone(state, data, **self.given(values), num_iterations=2)[0].agent, average=True)
+        return agent.policy(train.clone(state, data, **self.given(values), num_iterations=2)[0].agent, self.config, average=True)
 
     def learn(self, values, state, data):
-        return agent.policy(train.learn(state, data, **self.given(values), num_iterations=2)[0].agent, average=True)
+        return agent.policy(train.learn(state, data, **self.given(values), num_iterations=2)[0].agent, self.config, average=True)
 
     def draw(self, values, state, data):
         """The first half of what `learn` does after a step of the environments."""
@@ -57,19 +57,19 @@ class Stages:
 
     def descend(self, values, batches, state):
         """The second half."""
-        return agent.policy(train.gradient_steps(state.key, state, batches, **self.given(values))[0].agent, average=True)
+        return agent.policy(train.gradient_steps(state.key, state, batches, **self.given(values))[0].agent, self.config, average=True)
 
     def whole(self, values, key, demonstrations):
         carry = self.begin(values, *self.take(values, key, demonstrations))
         if not self.config.learns_from_rollouts:
             return self.clone(values, *carry)
         carry = self.collect(values, *carry)
-        return self.learn(values, *(self.imitate(values, *carry) if self.config.imitation_proposal else carry))
+        return self.learn(values, *(self.imitate(values, *carry) if self.config.imitation_steps else carry))
 
     def parts(self):
         """Most of the same, in parts."""
         names = ("take", "begin", "clone") if not self.config.learns_from_rollouts else ("take", "begin", "collect", "imitate", "draw", "descend")
-        return {name: getattr(self, name) for name in names if name != "imitate" or self.config.imitation_proposal}
+        return {name: getattr(self, name) for name in names if name != "imitate" or self.config.imitation_steps}
 
 
 class Traced:

@@ -208,8 +208,8 @@ def test_update_bc_by_hand(bc_loss, bc_action, expected, slope):
 
 def test_policy_is_the_actor_or_its_average_with_the_scale():
     state = fresh_agent(jax.random.key(0)).replace(average_actor="average", actor="actor")
-    assert agents.policy(state, average=False) == agents.Policy(actor="actor", scale=state.scale, noise=1.0)
-    assert agents.policy(state, average=True) == agents.Policy(actor="average", scale=state.scale, noise=0.0)
+    assert agents.policy(state, CONFIG, average=False) == agents.Policy(actor="actor", scale=state.scale, noise=1.0)
+    assert agents.policy(state, CONFIG, average=True) == agents.Policy(actor="average", scale=state.scale, noise=0.0)
 
 
 def test_networks_see_both_ends_of_a_transition_at_its_goal():

@@ -1,4 +1,4 @@
-"""A cloned policy that proposes actions beside the actor: what is chosen, in episodes and in targets, and that it stays what it is."""
+"""A second policy that is cloned at the start: that it stays what it is, and, where it proposes actions beside the actor, what is chosen."""
 
 import dataclasses
 import functools
@@ -15,14 +15,15 @@ from hindrl_jax.config import BatchConfig
 from hindrl_jax.core import agent as agents
 from hindrl_jax.core import train
 
-PROPOSING = dataclasses.replace(CONFIG, imitation_proposal=10)
+CLONING = dataclasses.replace(CONFIG, imitation_steps=10)
+PROPOSING = dataclasses.replace(CLONING, imitation_proposal=True)
 
 
 def playing(actor, action, *, log_std=-5.0):
     """An actor whose mode is `action` everywhere."""
-    last_layer = actor["params"]["Dense_1"]
-    last_layer = {"kernel": jnp.zeros_like(last_layer["kernel"]), "bias": jnp.array([np.arctanh(action), log_std], jnp.float32)}
-    return {"params": {**actor["params"], "Dense_1": last_layer}}
+    last = max(actor["params"])
+    last_layer = {"kernel": jnp.zeros_like(actor["params"][last]["kernel"]), "bias": jnp.array([np.arctanh(action), log_std], jnp.float32)}
+    return {"params": {**actor["params"], last: last_layer}}
 
 
 def preferring(critics, sign):
@@ -45,7 +46,7 @@ def agent_of(config, *, sign):
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 def test_what_is_done_is_what_the_target_critics_value_more(sign, chosen, noise):
     state = agent_of(PROPOSING, sign=sign)
-    policy = agents.policy(state, average=False).replace(noise=noise)
+    policy = agents.policy(state, PROPOSING, average=False).replace(noise=noise)
     action = agents.select_action(jax.random.key(1), policy, jnp.zeros((4, 3)), PROPOSING, action_dim=1)
     np.testing.assert_allclose(action, chosen, atol=0.03 if noise else 1e-5)  # deviations of e^-5 = 0.007
 
@@ -84,21 +85,41 @@ def test_the_imitation_is_frozen_and_the_rest_of_the_agent_learns():
     assert np.abs(after.actor["params"]["Dense_1"]["bias"] - start.actor["params"]["Dense_1"]["bias"]).max() > 0.0
 
 
-def test_no_imitation_is_kept_where_none_proposes():
+def test_there_is_no_imitation_where_none_is_cloned():
     state = with_constant_critics(fresh_agent(jax.random.key(0)), [0.0, 0.0])
     assert state.imitation is None
-    assert agents.policy(state, average=False).actor is state.actor
+    assert agents.policy(state, CONFIG, average=False).actor is state.actor
+
+
+@pytest.mark.parametrize(("config", "sign"), [(CLONING, 1.0), (PROPOSING, 1.0), (PROPOSING, -1.0)])
+def test_the_imitation_acts_alone_where_it_is_asked_and_without_noise(config, sign):
+    state = agent_of(config, sign=sign)
+    clone = agents.policy(state, config, average=True, imitates=True)
+    chex.assert_trees_all_equal_structs(clone, agents.policy(state, config, average=True))  # so that they are kept and saved alike
+    for noise in (0.0, 1.0):
+        action = agents.select_action(jax.random.key(1), clone.replace(noise=noise), jnp.zeros((4, 3)), config, action_dim=1)
+        np.testing.assert_allclose(action, -0.4, atol=1e-6)
+
+
+def test_a_clone_that_does_not_propose_has_no_part_in_what_is_done_and_learnt():
+    with_clone = agent_of(CLONING, sign=-1.0)
+    without = with_clone.replace(imitation=None)
+    assert agents.policy(with_clone, CLONING, average=False).actor is with_clone.actor
+    action = agents.select_action(jax.random.key(1), agents.policy(with_clone, CLONING, average=True), jnp.zeros((4, 3)), CLONING, action_dim=1)
+    expected = agents.select_action(jax.random.key(1), agents.policy(without, CONFIG, average=True), jnp.zeros((4, 3)), CONFIG, action_dim=1)
+    np.testing.assert_array_equal(action, expected)
+    batch = make_batch(action=ACTIONS, reward=ACTIONS[:, 0], discount=0.5)
+    after, plain = (one_update(jax.random.key(0), state, batch, config)[0] for state, config in ((with_clone, CLONING), (without, CONFIG)))
+    chex.assert_trees_all_equal(after.replace(imitation=None), plain)
 
 
 def test_the_imitation_is_cloned_and_all_else_stays_as_it_is():
     agent = dataclasses.replace(make_config().agent, learning_rate=1e-2)
-    config = make_config(agent=agent, imitation_proposal=300, batch=BatchConfig(batch_size=32))
+    config = make_config(agent=agent, imitation_steps=300, batch=BatchConfig(batch_size=32))
     data, env = make_data(config), make_env()
     start = train.init(jax.random.key(0), data, env, config)
     state = jax.jit(functools.partial(train.imitate, env=env, config=config))(start, data)
-    chex.assert_trees_all_equal(state.agent.replace(imitation=None), start.agent.replace(imitation=None))
-    assert (int(state.updates), int(state.env_steps)) == (0, 0)
-    alone = dataclasses.replace(state.agent, actor=state.agent.imitation, imitation=None)
-    act = train.make_policy(agents.policy(alone, average=False).replace(noise=0.0), env, make_config(agent=agent))
+    chex.assert_trees_all_equal(*(each.replace(agent=each.agent.replace(imitation=None)) for each in (state, start)))
+    act = train.make_policy(agents.policy(state.agent, config, average=True, imitates=True), env, config)
     action = act(jax.random.key(0), data.demonstrations.observations[:, 0], data.demonstrations.desired_goals)
     np.testing.assert_allclose(action[:, 1], -0.5, atol=0.2)  # all demonstrated second actions

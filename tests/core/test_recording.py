@@ -92,7 +92,7 @@ def collected_and_evaluated(config, data):
         key_init, key_evaluate = jax.random.split(key)
         state = train.init(key_init, data, env, config)
         state = with_output_bias(train.collect(state, data, env=env, config=config, num_iterations=60), [0.0, 0.0, 0.0, 0.0])
-        policy = agents.policy(state.agent, average=False).replace(noise=0.0)
+        policy = agents.policy(state.agent, config, average=False).replace(noise=0.0)
         return state.replay, train.evaluate(key_evaluate, policy, data, env=env, config=config, num_episodes=20)
 
     return jax.device_get(run(jax.random.key(0)))
@@ -128,7 +128,7 @@ def test_a_reverse_curriculum_moves_back_where_episodes_succeed():
     @jax.jit
     def run(key, bias):
         state = with_output_bias(train.init(key, data, env, config), bias)
-        act = train.make_policy(agents.policy(state.agent, average=False).replace(noise=0.0), env, config)
+        act = train.make_policy(agents.policy(state.agent, config, average=False).replace(noise=0.0), env, config)
 
         def step(state, key):
             state = train._interact(key, state, data, env, config, act)

@@ -43,7 +43,7 @@ def collected(seed, data):
 
 def actor_of(state, noise=0.0):
     """The policy that explores, with its mean actions or, at noise 1, as it does."""
-    return agents.policy(state.agent, average=False).replace(noise=noise)
+    return agents.policy(state.agent, make_config(), average=False).replace(noise=noise)
 
 
 @pytest.fixture(scope="module")

@@ -33,7 +33,9 @@ OWN_GOALS = GoalConfig(behavioural_goals="environment")
 def untrained(env=ENV, noise=0.0, **agent_fields):
     """A run of two seeds, 5 and 7, whose policies and critics are as they begin, in a task; other fields of the config beside those of its agent."""
     others = {
-        name: agent_fields.pop(name) for name in ("action_hold", "action_chunks", "imitation_proposal", "quirks", "goal") if name in agent_fields
+        name: agent_fields.pop(name)
+        for name in ("action_hold", "action_chunks", "imitation_steps", "imitation_proposal", "quirks", "goal")
+        if name in agent_fields
     }
     config = dataclasses.replace(CONFIG, **others, agent=dataclasses.replace(CONFIG.agent, net_arch=(6, 6), **agent_fields))
     decisions = hold(env, config.num_held, chunks=config.action_chunks)
@@ -43,7 +45,7 @@ def untrained(env=ENV, noise=0.0, **agent_fields):
     scale = InputScale(**{name: jnp.asarray(values, jnp.float32) for name, values in scale.items()})
     begin = jax.jit(jax.vmap(lambda key: agent.init(key, scale, config, action_dim=decisions.action_dim)))
     states = begin(jax.random.split(jax.random.key(3), 2))
-    policies = agent.policy(states, average=True).replace(noise=jnp.full(2, noise))
+    policies = agent.policy(states, config, average=True).replace(noise=jnp.full(2, noise))
     goals = GoalTable(goals=jnp.asarray(rng.normal(size=(2, 3, env.goal_dim)), jnp.float32), count=jnp.array([3, 3]))
     return Run(Path("runs/mine"), RunSpec(env, config, "1", (5, 7)), policies, goals, states.critics)
 
@@ -176,7 +178,7 @@ def test_what_plays_an_exported_policy_imports_numpy_alone():
 @pytest.mark.parametrize(
     ("case", "name"),
     [
-        (dict(imitation_proposal=2), "imitation_proposal"),
+        (dict(imitation_steps=2, imitation_proposal=True), "imitation_proposal"),
         (dict(quirks=QuirksConfig(achieved_goal_input=True)), "achieved_goal_input"),
     ],
 )

@@ -8,12 +8,16 @@ from types import SimpleNamespace
 
 import chex
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from tiny import CONFIG, ENV
 
 import hindrl_jax as hindrl
+from hindrl_jax.base.environments import action_to_env
 from hindrl_jax.core.agent import policy
+from hindrl_jax.core.inputs import network_inputs
+from hindrl_jax.core.networks import apply_actor
 from hindrl_jax.plotting import films
 from hindrl_jax.runs.shipped import shipped
 
@@ -46,22 +50,40 @@ def test_a_saved_run_sees_its_inputs_as_it_did_in_training(saved, tmp_path):
 
 def test_a_saved_policy_chooses_between_its_actor_and_its_imitation_as_it_did_in_training(tmp_path):
     """What is read back has both, and the critics that choose; played, it does what the policy in memory does."""
-    config = dataclasses.replace(CONFIG, imitation_proposal=2)
+    config = dataclasses.replace(CONFIG, imitation_steps=2, imitation_proposal=True)
     checkpoints = hindrl.Checkpoints(tmp_path / "checkpoint", seconds=0)
     result = hindrl.fit(ENV, hindrl.record_demonstrations(ENV, 2), config, seeds=[0], report=checkpoints.save_when_due)
     hindrl.save_run(tmp_path / "run", result)
     run = hindrl.load_run(tmp_path / "run", last=True)
-    expected = policy(result.state.agent, average=True)
-    assert expected.actor.keys() == {"actor", "imitation", "critics"}
+    expected = policy(result.state.agent, config, average=True)
+    assert expected.actor.keys() == {"actor", "imitation", "imitates", "critics"}
     chex.assert_trees_all_equal(run.policies, jax.device_get(expected))
     assert len(run.evaluate(episodes=3)) == 1
     assert run.play(2, seed=0).lengths.shape == (2,)
-    imitation = jax.tree.leaves(expected.actor["imitation"])
-    assert any(np.abs(a - b).max() > 0 for a, b in zip(imitation, jax.tree.leaves(expected.actor["actor"]), strict=True))
     # The same run, gone on with from its last checkpoint.
     again = hindrl.fit(ENV, hindrl.record_demonstrations(ENV, 2), config, seeds=[0], restore=checkpoints.restore)
     chex.assert_trees_all_equal(again.state.agent.imitation, result.state.agent.imitation)
     chex.assert_trees_all_equal(again.returned.actor, result.returned.actor)
+
+
+def test_a_saved_clone_is_what_acts(tmp_path):
+    """Of two seeds, the policies of one are returned as they were learnt, and the other's clone."""
+    config = dataclasses.replace(CONFIG, imitation_steps=2, stop_at=None)
+    result = hindrl.fit(ENV, hindrl.record_demonstrations(ENV, 2), config, seeds=[0, 1])
+    actor = result.returned.actor | {"imitates": np.array([0, 1], np.int32)}
+    result.returned = result.returned.replace(actor=actor, noise=np.array([0.0, 1.0]))
+    hindrl.save_run(tmp_path, result)
+    run, last = hindrl.load_run(tmp_path), hindrl.load_run(tmp_path, last=True)
+    assert (run.policies.actor["imitates"].tolist(), last.policies.actor["imitates"].tolist()) == ([0, 1], [0, 0])
+    rng = np.random.default_rng(0)
+    observation, goal = rng.normal(size=(5, ENV.observation_dim)), rng.normal(size=(5, ENV.goal_dim))
+    for index, (seed, network, agent) in enumerate([(0, "actor", config.agent), (1, "imitation", config.agent.for_imitation)]):
+        of_seed = jax.tree.map(lambda leaf, index=index: jnp.asarray(leaf[index]), (actor[network], result.state.agent.scale))
+        inputs = network_inputs(*map(jnp.asarray, (observation, ENV.achieved_goal(observation), goal)), of_seed[1], result.config)
+        action = action_to_env(apply_actor(of_seed[0], inputs.T, agent, action_dim=ENV.action_dim).mode.T, ENV)
+        for play in (run.policy(seed), run.numpy_policy(seed)):
+            np.testing.assert_allclose(play(observation, goal), action, atol=1e-5)
+    assert len(run.evaluate(episodes=2)) == 2
 
 
 def test_a_film_that_cannot_be_drawn_is_a_warning(saved, tmp_path, monkeypatch):

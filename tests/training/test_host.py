@@ -220,7 +220,9 @@ def test_cloning_needs_no_environment_but_to_be_judged(env):
 
 def test_other_options_work_as_well(env, demonstrations):
     """All at once, since each would be compiled for long."""
-    config = dataclasses.replace(with_batch(CONFIG, hindrl_sampling_strategy="joint_intersection"), imitation_proposal=3, steps=120)
+    config = dataclasses.replace(
+        with_batch(CONFIG, hindrl_sampling_strategy="joint_intersection"), imitation_steps=3, imitation_proposal=True, steps=120
+    )
     result = hindrl.fit(env, demonstrations, config)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(jax.device_get(result.state.agent)))
     replay = jax.device_get(result.state.replay)

@@ -32,7 +32,7 @@ def trained(env, demonstrations, config=CONFIG, **changes):
     def begin(key):
         data = guidance(table, decisions, config)
         begun = train.RolloutState(env_state=(), observation=None, desired_goal=None)
-        return train.agents.policy(train.init(key, data, decisions, config, begun=begun).agent, average=True), data.behavioural_goals
+        return train.agents.policy(train.init(key, data, decisions, config, begun=begun).agent, config, average=True), data.behavioural_goals
 
     return TrainedPolicies(env, config, *jax.vmap(begin)(jax.random.split(jax.random.key(0), 2)))
 

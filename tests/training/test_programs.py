@@ -35,7 +35,7 @@ def check(programs, tables, num_runs):
     assert np.asarray(state.updates).tolist() == [programs.chunk] * num_runs
     assert all(values.shape == (num_runs,) for values in metrics.values())
     for num_episodes in (3, FRESH_EPISODES):
-        key, evaluation = programs.evaluate(key, policy(state.agent, average=True), guidance, num_episodes)
+        key, evaluation = programs.evaluate(key, policy(state.agent, programs.config, average=True), guidance, num_episodes)
         assert evaluation.success.shape == evaluation.length.shape == (num_runs, num_episodes)
 
 

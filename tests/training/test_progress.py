@@ -20,7 +20,7 @@ CONFIG = TrainConfig(steps=4_000)
 WIPE = "\r\x1b[2K"
 
 
-def result(done, *, every=100, seeds=(0, 1), algo="hindrl", finished=False):
+def result(done, *, every=100, seeds=(0, 1), algo="hindrl", finished=False, cloned=None):
     """A training of 4,000 steps, of which so many are done, at 100 steps per second; success is the share of steps done, the second seed's half."""
     env_steps = (lambda step: 0) if algo == "bc" else (lambda step: step)
     rows = [
@@ -36,6 +36,7 @@ def result(done, *, every=100, seeds=(0, 1), algo="hindrl", finished=False):
         steps_unit="updates" if algo == "bc" else "steps",
         train_seconds=done / 100,
         final_success=np.zeros(len(seeds)) if finished else None,
+        cloned_success=cloned,
         latest_success=lambda: float(np.mean([row.success for row in rows[-len(seeds) :]])) if rows else None,
     )
 
@@ -65,6 +66,20 @@ def test_a_log_file_gets_ten_plain_lines():
 def test_what_sampled_actions_solve_stands_beside():
     rows = [dataclasses.replace(row, metrics={"evaluation/sampled_success": share}) for row, share in zip(result(100).rows, (1.0, 0.5), strict=True)]
     assert evaluation_line(rows) == "      100 steps      100 updates     1.0 s   success   2% (worst   1%)   sampled  75%   length  50.0"
+
+
+@pytest.mark.parametrize(
+    ("success", "line"),
+    [([0.5, 0.75], "a clone of the demonstrations solves 62% (worst 50%);"), ([1.0], "a clone of the demonstrations solves 100%;")],
+)
+def test_what_a_clone_solves_is_said_once_and_first(success, line):
+    screen = console()
+    progress = hindrl.ProgressBar(console=screen)
+    for done in range(0, 4_001, 400):
+        progress(result(done, cloned=np.array(success)))
+    said = screen.file.getvalue().splitlines()
+    assert [index for index, each in enumerate(said) if each.startswith(line)] == [0]
+    assert len(said) == 11
 
 
 def test_a_terminal_shows_the_lines_above_a_bar_that_goes_in_the_end():

@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny
@@ -192,8 +193,8 @@ class Killed(Exception):
     pass
 
 
-def fit(config=CONFIG, **choices):
-    return hindrl.fit(ENV, corridor_demonstrations(), config, seeds=SEEDS, **choices)
+def fit(config=CONFIG, demonstrations=None, **choices):
+    return hindrl.fit(ENV, corridor_demonstrations() if demonstrations is None else demonstrations, config, seeds=SEEDS, **choices)
 
 
 @pytest.fixture(scope="module")
@@ -242,6 +243,53 @@ def test_a_run_goes_on_where_it_was_stopped_with_the_policies_that_were_kept(sol
         found, expected = (getattr(result, name).replace(seconds=0.0) for result in (resumed, solved))
         jax.tree.map(np.testing.assert_array_equal, found, expected)
     np.testing.assert_array_equal(resumed.evaluation_steps, solved.evaluation_steps)
+
+
+def easily_imitated():
+    """Two demonstrations, at a speed that solves the task and with starts of its own."""
+    walking = corridor_demonstrations((1.25, 1.25))
+    return walking.replace(observations=walking.observations.at[:, :, 0].set(jnp.array([[0.2], [0.8]])))
+
+
+CLONING = dataclasses.replace(CONFIG, imitation_steps=300, agent=dataclasses.replace(CONFIG.agent, learning_rate=1e-2))
+
+
+@pytest.fixture(scope="module")
+def cloned():
+    """A run that ends when one policy of each seed is good enough, which the clone is at once."""
+    return fit(CLONING, easily_imitated())
+
+
+def test_a_clone_that_is_good_enough_is_returned_and_nothing_else_is_tried(cloned):
+    assert (cloned.cloned_success == 1.0).all()
+    assert (cloned.env_steps, cloned.updates, cloned.returned.env_steps.tolist()) == (0, 0, [0, 0])
+    assert cloned.returned.actor["imitates"].tolist() == [1, 1]
+    assert (cloned.returned.success == 1.0).all()
+    summary = cloned.summaries()[0]
+    assert (summary.cloned_success, summary.returned_env_steps, summary.returned_updates) == (1.0, 0, 0)
+    assert summary.final_success == 1.0  # one that knows nothing, which learning would have begun with, arrives, too
+
+
+def test_learning_goes_the_same_way_with_and_without_a_clone(tmp_path):
+    """Nothing is confirmed, and the run is killed and resumed after its first evaluation."""
+    config = dataclasses.replace(CLONING, stop_at=None, steps=80)
+    without = fit(dataclasses.replace(config, imitation_steps=0), easily_imitated())
+    checkpoints = Checkpoints(tmp_path, seconds=0)
+
+    def report(result):
+        checkpoints.save_when_due(result)
+        if result.rows:
+            raise Killed
+
+    with pytest.raises(Killed):
+        fit(config, easily_imitated(), report=report)
+    resumed = fit(config, easily_imitated(), restore=Checkpoints(tmp_path).restore)
+    assert (resumed.cloned_success == 1.0).all()
+    assert without.cloned_success is None
+    for found, expected in zip(jax.tree.leaves(resumed.state.agent.actor), jax.tree.leaves(without.state.agent.actor), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5)
+    kept = resumed.kept.actor["imitates"] * (resumed.kept.env_steps == 0) * (resumed.kept.success == 1.0)
+    assert kept.sum(axis=1).tolist() == [1, 1]
 
 
 def test_a_report_that_returns_true_ends_the_run_which_can_be_saved(tmp_path):
