@@ -49,8 +49,8 @@ class TrainConfig:
     """Those states are near the end of each demonstration at first, and move towards its beginning where episodes succeed from them three times in a
     row: the reverse curriculum of RFCL (Tao et al., 2024)."""
     imitation_steps: int = 0
-    """Gradient steps of behaviour cloning at the start, which make a second policy, with the network of bc. It is one of those that may be returned;
-    reinforcement learning begins and goes on without it. 0 for no such policy."""
+    """Gradient steps of behaviour cloning at the start, rounded up to a multiple of 3, which make a second policy, with the network of bc. As it is
+    after each third of them it may be returned; reinforcement learning begins and goes on without it. 0 for no such policy."""
     imitation_proposal: bool = False
     """That policy proposes an action beside the actor's: whichever the target critics value more is taken, in episodes, evaluations and targets
     (IBRL, Hu et al., 2024)."""

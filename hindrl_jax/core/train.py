@@ -18,7 +18,7 @@ from hindrl_jax.base.types import Array, TimeStep, Transition
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.core import agent as agents
 from hindrl_jax.core import curriculum, replay, rollout
-from hindrl_jax.core.agent import AgentState, Metrics, Policy
+from hindrl_jax.core.agent import AgentState, Metrics, Params, Policy
 from hindrl_jax.core.batch import goal_test, sample_batch, sample_demonstrations
 from hindrl_jax.core.curriculum import Curriculum
 from hindrl_jax.core.goals import nearby_goal
@@ -29,6 +29,8 @@ from hindrl_jax.core.replay import RecordedStep, ReplayState
 from hindrl_jax.core.rollout import Act, DemoResets, Evaluation, RolloutState
 from hindrl_jax.core.schedules import schedule
 
+IMITATION_PARTS = 3
+"""Times at which the policy that `imitate` clones is looked at: which is best differs by seed and task."""
 _IMITATION = 2**16  # the random numbers of `imitate` are none of those that a state's key gives when it is split
 
 
@@ -213,16 +215,25 @@ def clone(state: TrainState, guidance: Guidance, *, env: Environment, config: Tr
     return state, jax.tree.map(jnp.mean, metrics)
 
 
-def imitate(state: TrainState, guidance: Guidance, *, env: Environment, config: TrainConfig) -> TrainState:
-    """Clones a second policy by `imitation_steps` gradient steps; all else stays as it is, and so does what follows."""
+def imitate(state: TrainState, guidance: Guidance, *, env: Environment, config: TrainConfig) -> tuple[TrainState, Params]:
+    """Clones a second policy by `imitation_steps` gradient steps; all else stays as it is, and so does what follows.
+
+    Returns:
+      The new state, and the policy's parameters after each of `IMITATION_PARTS` equal parts of the steps, leaves (parts, ...), the state's the last.
+    """
     cloning = dataclasses.replace(config, agent=config.agent.for_imitation)
     start = state.replace(
         agent=agents.with_actor(state.agent, state.agent.imitation),
         key=jax.random.fold_in(state.key, _IMITATION),
         updates=jnp.zeros_like(state.updates),
     )
-    cloned, _ = clone(start, guidance, env=env, config=cloning, num_iterations=config.imitation_steps)
-    return state.replace(agent=state.agent.replace(imitation=cloned.agent.average_actor))
+
+    def part(state: TrainState, _: None) -> tuple[TrainState, Params]:
+        state, _metrics = clone(state, guidance, env=env, config=cloning, num_iterations=-(-config.imitation_steps // IMITATION_PARTS))
+        return state, state.agent.average_actor
+
+    cloned, clones = jax.lax.scan(part, start, length=IMITATION_PARTS)
+    return state.replace(agent=state.agent.replace(imitation=cloned.agent.average_actor)), clones
 
 
 def evaluate(key: Array, policy: Policy, guidance: Guidance, *, env: Steppable, config: TrainConfig, num_episodes: int) -> Evaluation:

@@ -18,6 +18,7 @@ from hindrl_jax.config import TrainConfig
 from hindrl_jax.core.agent import Policy, policy
 from hindrl_jax.core.holding import hold, hold_demonstrations, in_control_steps, with_action_hold
 from hindrl_jax.core.rollout import Evaluation
+from hindrl_jax.core.train import IMITATION_PARTS
 from hindrl_jax.training.checks import check_config, check_memory, check_seeds, check_trainable, configs_per_seed, demonstrations_per_seed
 from hindrl_jax.training.devices import gather, spread
 from hindrl_jax.training.host import HostPrograms
@@ -164,13 +165,18 @@ def _train(result: Result, programs: Programs, report: Report) -> None:
 
 
 def _imitate(result: Result, programs: Programs, started: float) -> None:
-    """Clones the demonstrations. What comes of it is the first policy that is kept."""
-    result.state = programs.imitate(result.state, result.guidance)
-    clones = policy(result.state.agent, result.config, average=True, imitates=True)
-    evaluation = _played(result, programs, clones, result.config.eval_episodes)
-    result.cloned_success = np.asarray(evaluation.success).mean(axis=1)
-    result.train_seconds = time.perf_counter() - started
-    _keep(result, programs, clones, np.zeros(len(result.seeds)), evaluation)
+    """Clones the demonstrations. What comes of it are the first policies that are kept."""
+    result.state, clones = programs.imitate(result.state, result.guidance)
+    result.cloned_success = np.zeros(len(result.seeds))
+    for part in range(IMITATION_PARTS):
+        agent = result.state.agent.replace(imitation=jax.tree.map(lambda leaf, part=part: leaf[:, part], clones))
+        policies = policy(agent, result.config, average=True, imitates=True)
+        evaluation = _played(result, programs, policies, result.config.eval_episodes)
+        result.cloned_success = np.maximum(result.cloned_success, np.asarray(evaluation.success).mean(axis=1))
+        result.train_seconds = time.perf_counter() - started
+        _keep(result, programs, policies, np.zeros(len(result.seeds)), evaluation)
+        if result.kept.all_confirmed:
+            break
 
 
 def _evaluate(result: Result, programs: Programs, started: float) -> None:

@@ -22,7 +22,7 @@ from hindrl_jax.base.steppers import HostStepped, Outcome, Stepper
 from hindrl_jax.base.types import Array, Episodes, TimeStep
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.core import train as training
-from hindrl_jax.core.agent import Metrics, Policy, policy
+from hindrl_jax.core.agent import Metrics, Params, Policy, policy
 from hindrl_jax.core.goals import sample_goals
 from hindrl_jax.core.guidance import Guidance
 from hindrl_jax.core.rollout import Evaluation, RolloutState
@@ -108,7 +108,7 @@ class HostPrograms(Programs):
             state = self._stepped(state, plan, guidance)
         return state
 
-    def imitate(self, state: TrainState, guidance: Guidance) -> TrainState:
+    def imitate(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, Params]:
         return self._programs["imitate"](state, guidance, self.values)
 
     def learn(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, Metrics]:

@@ -20,7 +20,7 @@ from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Array, Episodes
 from hindrl_jax.config import TrainConfig, sweepable_value, with_traced_values
 from hindrl_jax.core import train as training
-from hindrl_jax.core.agent import Metrics, Policy, policy
+from hindrl_jax.core.agent import Metrics, Params, Policy, policy
 from hindrl_jax.core.guidance import Guidance
 from hindrl_jax.core.guidance import guidance as guidance_of
 from hindrl_jax.core.rollout import Evaluation, RolloutState
@@ -84,8 +84,8 @@ class Programs(abc.ABC):
         """Fills the replay by random actions; the state is donated."""
 
     @abc.abstractmethod
-    def imitate(self, state: TrainState, guidance: Guidance) -> TrainState:
-        """Clones a second policy, see `imitation_steps`; the state is donated."""
+    def imitate(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, Params]:
+        """Clones a second policy, see `core.train.imitate`; the state is donated."""
 
     @abc.abstractmethod
     def learn(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, Metrics]:
@@ -165,7 +165,7 @@ class JaxPrograms(Programs):
     def collect(self, state: TrainState, guidance: Guidance) -> TrainState:
         return self._programs["collect"](state, guidance, self.values)
 
-    def imitate(self, state: TrainState, guidance: Guidance) -> TrainState:
+    def imitate(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, Params]:
         return self._programs["imitate"](state, guidance, self.values)
 
     def learn(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, Metrics]:

@@ -67,8 +67,8 @@ class SeedSummary:
     episode_length: float
     """Mean length of the 100 fresh episodes of the last policy."""
     cloned_success: float | None
-    """Share of an evaluation's episodes that the policy cloned at the start solves (`TrainConfig.imitation_steps`); None where there is none. Where
-    that one is returned, `returned_env_steps` is 0."""
+    """Share of an evaluation's episodes that the policy cloned at the start solves (`TrainConfig.imitation_steps`), the most of three; None where
+    there is none. Where that one is returned, `returned_env_steps` is 0."""
     evaluation_steps: int
     """Environment steps that evaluations and the choice of the returned policy took; `env_steps` does not count them."""
 
@@ -100,7 +100,7 @@ class Result:
     evaluation_steps: np.ndarray | None = None
     """(S,) int, environment steps that evaluations took so far; None before the first."""
     cloned_success: np.ndarray | None = None
-    """(S,) share of an evaluation's episodes that the policies cloned at the start solve; None where there are none."""
+    """(S,) share of an evaluation's episodes that the policies cloned at the start solve, the most of three; None where there are none."""
     returned: Returned | None = None
     """The best policy of each run; None while the experiment is under way."""
     final_success: np.ndarray | None = None

@@ -69,7 +69,7 @@ VALUES = {
     "learning_starts": (30, 20),
     "demo_reset_ratio": (0.5, 0.25),
     "demo_reset_curriculum": (True, False),
-    "imitation_steps": (2, 3),
+    "imitation_steps": (3, 6),
     "imitation_proposal": (True, False),
     "buffer_size": (60, 40),
     "batch_size": (16, 8),

