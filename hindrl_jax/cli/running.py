@@ -140,7 +140,7 @@ def run(
             nonlocal learning
             if not writer.started:
                 begin(result)
-            elif not learning:
+            elif not learning and result.updates:
                 learning = True
                 progress.say(f"first updates after {time.perf_counter() - STARTED:.1f} s; the seconds below count training only")
             for index, of_setting in enumerate(writer.runs):

@@ -104,7 +104,7 @@ class AgentConfig:
 
     @property
     def for_imitation(self) -> AgentConfig:
-        """The same with the network of bc; not checked, since other values may be traced."""
+        """The same with the network of bc, or one's own `actor_network`; not checked, since other values may be traced."""
         agent = copy.copy(self)
         object.__setattr__(agent, "net_arch", IMITATION_NET_ARCH)
         object.__setattr__(agent, "residual", False)

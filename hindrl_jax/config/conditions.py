@@ -20,7 +20,7 @@ def _has_demo_rows(config: TrainConfig) -> bool:
 
 
 def _clones(config: TrainConfig) -> bool:
-    """Whether cloning is ever part of the loss; a policy that `imitation_steps` make clones by itself."""
+    """Whether cloning is ever part of the loss; the policy of `imitation_steps` is cloned whatever this says."""
     return not config.learns_from_rollouts or config.agent.bc_weight > 0.0
 
 

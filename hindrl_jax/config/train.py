@@ -92,17 +92,18 @@ class TrainConfig:
             raise ValueError(f"demo_reset_curriculum = {self.demo_reset_curriculum} is of no use while demo_reset_ratio = 0: raise that, too")
         if self.action_chunks and self.action_hold == 1:
             raise ValueError("action_chunks = True is of no use while action_hold = 1: raise that, too, or set it to None")
-        if self.imitation_proposal and self.imitation_steps == 0:
-            raise ValueError("imitation_proposal = True is of no use while imitation_steps = 0: raise that, too")
         if self.algo == "bc":
             given: dict[str, Any] = {
                 "imitation_steps": self.imitation_steps,
+                "imitation_proposal": self.imitation_proposal,
                 "q_filter": self.agent.q_filter != "off" and self.agent.q_filter,
                 "base": self.agent.base != "tqc" and self.agent.base,
             }
             for name, value in given.items():
                 if value:
                     raise ValueError(f"{name} = {value} has no effect on bc, which is behaviour cloning alone: drop it, or choose another algo")
+        if self.imitation_proposal and self.imitation_steps == 0:
+            raise ValueError("imitation_proposal = True is of no use while imitation_steps = 0: raise that, too")
         if self.algo == "tqcfd" and self.batch.relabelled_per_original > 0:
             raise ValueError(
                 f"tqcfd does not relabel, but relabelled_per_original = {self.batch.relabelled_per_original}: set it to 0, or choose hindrl"

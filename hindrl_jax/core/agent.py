@@ -98,7 +98,7 @@ def policy(state: AgentState, config: TrainConfig, *, average: bool, imitates: b
     actor = state.average_actor if average else state.actor
     noise = jnp.zeros_like(state.log_alpha) if average else jnp.ones_like(state.log_alpha)
     if state.imitation is not None and (average or config.imitation_proposal):
-        actor = {"actor": actor, "imitation": state.imitation, "imitates": jnp.full(noise.shape, imitates, jnp.int32)}
+        actor = {"actor": actor, "imitation": state.imitation, "imitates": jnp.full_like(noise, imitates, jnp.int32)}
         if config.imitation_proposal:
             actor["critics"] = state.target_critics
     return Policy(actor=actor, scale=state.scale, noise=noise)

@@ -215,11 +215,11 @@ def clone(state: TrainState, guidance: Guidance, *, env: Environment, config: Tr
     return state, jax.tree.map(jnp.mean, metrics)
 
 
-def imitate(state: TrainState, guidance: Guidance, *, env: Environment, config: TrainConfig) -> tuple[TrainState, Params]:
+def imitate(state: TrainState, guidance: Guidance, *, env: Environment, config: TrainConfig) -> tuple[TrainState, list[Params]]:
     """Clones a second policy by `imitation_steps` gradient steps; all else stays as it is, and so does what follows.
 
     Returns:
-      The new state, and the policy's parameters after each of `IMITATION_PARTS` equal parts of the steps, leaves (parts, ...), the state's the last.
+      The new state, and the policy's parameters after each of `IMITATION_PARTS` equal parts of the steps, the last of which are the state's, too.
     """
     cloning = dataclasses.replace(config, agent=config.agent.for_imitation)
     start = state.replace(
@@ -233,7 +233,8 @@ def imitate(state: TrainState, guidance: Guidance, *, env: Environment, config: 
         return state, state.agent.average_actor
 
     cloned, clones = jax.lax.scan(part, start, length=IMITATION_PARTS)
-    return state.replace(agent=state.agent.replace(imitation=cloned.agent.average_actor)), clones
+    parts = [jax.tree.map(lambda leaf, part=part: leaf[part], clones) for part in range(IMITATION_PARTS)]
+    return state.replace(agent=state.agent.replace(imitation=cloned.agent.average_actor)), parts
 
 
 def evaluate(key: Array, policy: Policy, guidance: Guidance, *, env: Steppable, config: TrainConfig, num_episodes: int) -> Evaluation:

@@ -174,9 +174,10 @@ def numpy_form(trained: TrainedPolicy) -> tuple[dict[str, np.ndarray], dict[str,
       UserError: if the policy is made of what NumPy has no form of here.
     """
     env, config = trained.env, trained.config
-    actor, agent = trained.policy.actor, config.agent
+    actor, agent, noise = trained.policy.actor, config.agent, trained.noise
     if "imitates" in actor:  # one of two networks
-        actor, agent = (actor["imitation"], config.agent.for_imitation) if actor["imitates"] else (actor["actor"], agent)
+        imitates = bool(actor["imitates"])
+        actor, agent, noise = (actor["imitation"], config.agent.for_imitation, 0.0) if imitates else (actor["actor"], agent, noise)
     unusual = {
         "imitation_proposal": config.imitation_proposal,
         "achieved_goal_input": config.quirks.achieved_goal_input,
@@ -194,7 +195,7 @@ def numpy_form(trained: TrainedPolicy) -> tuple[dict[str, np.ndarray], dict[str,
         "achieved": _entries_of_achieved_goal(env) if config.relative_goals else None,
         "action_hold": trained.action_hold,
         "chunks": trained.chunks,
-        "noise": trained.noise,
+        "noise": noise,
         "whole_actions": takes_whole_actions(env),
     }
     scale = trained.policy.scale

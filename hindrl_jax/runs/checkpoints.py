@@ -124,7 +124,7 @@ class Checkpoints:
                 state=state,
                 key=key,
                 kept=kept,
-                evaluation_steps=np.asarray(progress["evaluation_steps"], np.int64) if progress["rows"] else None,
+                evaluation_steps=np.asarray(progress["evaluation_steps"], np.int64) if progress["evaluation_steps"] else None,
                 cloned_success=None if progress.get("cloned_success") is None else np.asarray(progress["cloned_success"]),
                 rows=[Row(**row) for row in progress["rows"]],
                 chunks=[{name: np.asarray(values, np.float32) for name, values in chunk.items()} for chunk in progress["chunks"]],

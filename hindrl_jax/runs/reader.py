@@ -142,7 +142,7 @@ class Run:
         Args:
           episodes: how many, per seed.
           key: which.
-          noise: of the actions, 0 for the mean ones, 1 for sampled ones; None for what the run has found to be best.
+          noise: of the actions, 0 for the mean ones, 1 for sampled ones; None for what the run has found to be best. A clone's are mean ones.
           report: called with the number of episodes played so far, all seeds together, where they are played one by one: in robosuite.
         """
         keys = jax.random.split(jax.random.key(0) if key is None else key, len(self.spec.seeds))
@@ -160,7 +160,7 @@ class Run:
           path: a .gif or .mp4 file, or a .png file for the last state alone.
           seed: one of the run's seeds.
           key: which episode, or (N,) keys of N episodes to be shown one after the other.
-          noise: of the actions, 0 for the mean ones, 1 for sampled ones; None for what the run has found to be best.
+          noise: of the actions, 0 for the mean ones, 1 for sampled ones; None for what the run has found to be best. A clone's are mean ones.
 
         Raises:
           UserError: if the run has no such seed, or the film cannot be drawn.
@@ -190,7 +190,7 @@ class Run:
           episodes: N, how many.
           seed: one of the run's seeds.
           key: which.
-          noise: of the actions, 0 for the mean ones, 1 for sampled ones; None for what the run has found to be best.
+          noise: of the actions, 0 for the mean ones, 1 for sampled ones; None for what the run has found to be best. A clone's are mean ones.
 
         Returns:
           A table of N episodes. Where JAX steps the environment, with their states; rows after the end repeat the last one, and `desired_goals` are

@@ -77,7 +77,10 @@ class RunSpec:
             raise UserError(f"{where}: env_args = {env_args!r} is not usable: it must be an object of the environment's arguments")
         if not (isinstance(seeds, list) and seeds and all(type(seed) is int and 0 <= seed < 2**32 for seed in seeds)):
             raise UserError(f"{where}: seeds = {seeds!r} is not usable: it must be a list of whole numbers from 0 to {2**32 - 1}")
-        env, config = make(data["env"], **env_args), _config_from_dict(TrainConfig, data["config"], "config", where)
+        fields = data["config"]
+        if isinstance(fields, dict) and fields.get("imitation_proposal") == 0:  # a number of steps, before it was a switch
+            fields = fields | {"imitation_proposal": False}
+        env, config = make(data["env"], **env_args), _config_from_dict(TrainConfig, fields, "config", where)
         if config.own_goals and hasattr(env, "success") and "success" not in env_args:
             raise UserError(
                 f"{where} is of a version in which networks saw goals otherwise and episodes ended at them, so its policies would be misread: train "

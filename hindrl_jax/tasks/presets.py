@@ -122,7 +122,7 @@ def _rounded_down(value: float) -> float:
     return float(decimal.Context(prec=4, rounding=decimal.ROUND_FLOOR).create_decimal(str(value)))
 
 
-_IMITATION_STEPS = 750  # by the cable tasks, where more are no better, and 250 are worse (docs/cables.md)
+_IMITATION_STEPS = 750  # by the cable tasks (docs/recipe.md, Imitation first)
 _FRAMEWORK: dict[str, Any] = dict(input_encoding="raw", actor_average_span=0.0, relative_value=False)
 """How the networks of the thesis's framework are fed, trained and evaluated."""
 

@@ -18,7 +18,7 @@ from hindrl_jax.base.environments import Environment, RelabelsObservations, Rest
 from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.base.steppers import can_step_on_host, gives_goals
 from hindrl_jax.base.types import Episodes
-from hindrl_jax.config import RESIDUAL_EXPANSION, SWEEPABLE, TrainConfig, sweepable_value, with_traced_values
+from hindrl_jax.config import IMITATION_NET_ARCH, RESIDUAL_EXPANSION, SWEEPABLE, TrainConfig, sweepable_value, with_traced_values
 from hindrl_jax.core.train import warm_up_iterations
 from hindrl_jax.training.devices import free_memory, seed_mesh
 
@@ -181,6 +181,9 @@ def _numbers_in_memory(env: Environment, config: TrainConfig, num_demos: int) ->
     weights = sum(before * after for before, after in zip([inputs, *widths], [*widths, agent.critic_outputs], strict=True))
     demonstrations = num_demos * steps * (env.observation_dim + action_dim + state_dim(env))
     networks = weights * (6 + 4 * agent.num_critics)  # parameters, targets and averages, moments, and those that are kept
+    if config.imitation_steps > 0:  # parameters, moments, the average, three clones and those that are kept
+        first, second = IMITATION_NET_ARCH
+        networks += 11 * (2 * dim * first + first * second + 2 * second * action_dim)
     in_networks = (1 + agent.num_critics) * sum(widths)
     if not config.learns_from_rollouts:
         drawn, replay = batch.batch_size * (dim + sum(widths)), 0.0

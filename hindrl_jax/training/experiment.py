@@ -18,7 +18,6 @@ from hindrl_jax.config import TrainConfig
 from hindrl_jax.core.agent import Policy, policy
 from hindrl_jax.core.holding import hold, hold_demonstrations, in_control_steps, with_action_hold
 from hindrl_jax.core.rollout import Evaluation
-from hindrl_jax.core.train import IMITATION_PARTS
 from hindrl_jax.training.checks import check_config, check_memory, check_seeds, check_trainable, configs_per_seed, demonstrations_per_seed
 from hindrl_jax.training.devices import gather, spread
 from hindrl_jax.training.host import HostPrograms
@@ -167,16 +166,20 @@ def _train(result: Result, programs: Programs, report: Report) -> None:
 def _imitate(result: Result, programs: Programs, started: float) -> None:
     """Clones the demonstrations. What comes of it are the first policies that are kept."""
     result.state, clones = programs.imitate(result.state, result.guidance)
-    result.cloned_success = np.zeros(len(result.seeds))
-    for part in range(IMITATION_PARTS):
-        agent = result.state.agent.replace(imitation=jax.tree.map(lambda leaf, part=part: leaf[:, part], clones))
-        policies = policy(agent, result.config, average=True, imitates=True)
+    finite = np.all([np.isfinite(leaf).all(axis=tuple(range(1, leaf.ndim))) for leaf in jax.tree.leaves(gather(clones[-1]))], axis=0)
+    if not finite.all():
+        raise Diverged(f"the clone of the demonstrations of seed {result.seeds[int(np.argmin(finite))]} is not finite: try a lower learning_rate")
+    best: Evaluation | None = None
+    for clone in clones:
+        policies = policy(result.state.agent.replace(imitation=clone), result.config, average=True, imitates=True)
         evaluation = _played(result, programs, policies, result.config.eval_episodes)
-        result.cloned_success = np.maximum(result.cloned_success, np.asarray(evaluation.success).mean(axis=1))
+        best = evaluation if best is None else better(best, evaluation)[1]
+        result.cloned_success = np.asarray(best.success).mean(axis=1)
         result.train_seconds = time.perf_counter() - started
         _keep(result, programs, policies, np.zeros(len(result.seeds)), evaluation)
-        if result.kept.all_confirmed:
-            break
+        if result.kept.all_confirmed:  # and so the run ends here
+            result.rows += _rows(result, best, {})
+            return
 
 
 def _evaluate(result: Result, programs: Programs, started: float) -> None:

@@ -108,7 +108,7 @@ class HostPrograms(Programs):
             state = self._stepped(state, plan, guidance)
         return state
 
-    def imitate(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, Params]:
+    def imitate(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, list[Params]]:
         return self._programs["imitate"](state, guidance, self.values)
 
     def learn(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, Metrics]:

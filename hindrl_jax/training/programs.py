@@ -84,7 +84,7 @@ class Programs(abc.ABC):
         """Fills the replay by random actions; the state is donated."""
 
     @abc.abstractmethod
-    def imitate(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, Params]:
+    def imitate(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, list[Params]]:
         """Clones a second policy, see `core.train.imitate`; the state is donated."""
 
     @abc.abstractmethod
@@ -165,7 +165,7 @@ class JaxPrograms(Programs):
     def collect(self, state: TrainState, guidance: Guidance) -> TrainState:
         return self._programs["collect"](state, guidance, self.values)
 
-    def imitate(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, Params]:
+    def imitate(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, list[Params]]:
         return self._programs["imitate"](state, guidance, self.values)
 
     def learn(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, Metrics]:

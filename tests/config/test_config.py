@@ -190,6 +190,7 @@ def test_the_algorithm_must_fit_its_settings(fitting, contradiction, name):
     "changes",
     [
         dict(imitation_steps=1),
+        dict(imitation_proposal=True),
         dict(agent=AgentConfig(q_filter="hard")),
         dict(agent=AgentConfig(base="sac")),
     ],

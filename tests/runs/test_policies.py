@@ -114,6 +114,17 @@ def test_a_run_whose_networks_saw_goals_otherwise_is_refused():
         RunSpec.from_json(written, "config.json")
 
 
+def test_a_run_from_before_proposals_were_a_switch_is_read_where_it_has_none():
+    written = untrained().spec.to_json()
+    expected = RunSpec.from_json(written, "config.json")
+    before = written | {"config": {name: value for name, value in written["config"].items() if name != "imitation_steps"}}
+    before["config"]["imitation_proposal"] = 0
+    assert RunSpec.from_json(before, "config.json") == expected
+    before["config"]["imitation_proposal"] = 2_000
+    with pytest.raises(hindrl.UserError, match="imitation_proposal = 2000 is not usable"):
+        RunSpec.from_json(before, "config.json")
+
+
 def test_policies_may_be_called_within_compiled_programs():
     policy = untrained().policy()
     observation, goal = draws(ENV, 4)

@@ -281,6 +281,6 @@ def test_other_formats_are_learned_from(env, file, demonstrations, tmp_path):
 @pytest.mark.slow
 def test_the_corner_is_learned_from_five_demonstrations(env, demonstrations):
     config = dataclasses.replace(hindrl.preset(env=env), stop_at=0.95)
-    config = dataclasses.replace(config, steps=6_000, agent=dataclasses.replace(config.agent, net_arch=(64, 64)))
+    config = dataclasses.replace(config, steps=6_000, imitation_steps=0, agent=dataclasses.replace(config.agent, net_arch=(64, 64)))
     result = hindrl.fit(env, demonstrations, config, seeds=[0])
     assert result.returned.success[0] >= 0.9

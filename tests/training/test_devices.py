@@ -23,7 +23,7 @@ from hindrl_jax.config import AgentConfig, BatchConfig, TrainConfig
 
 env = hindrl.make("FixedGridPickAndPlace", size=4, random_box_size=1, horizon=20)
 config = TrainConfig(
-    steps=60, num_envs=2, updates_per_iteration=1, learning_starts=40, buffer_size=200, eval_every=20, eval_episodes=4,
+    steps=60, num_envs=2, updates_per_iteration=1, learning_starts=40, buffer_size=200, eval_every=20, eval_episodes=4, imitation_steps=3,
     batch=BatchConfig(batch_size=8), agent=AgentConfig(net_arch=(4,), num_quantiles=3, top_quantiles_to_drop_per_net=1),
 )
 demonstrations = [hindrl.record_demonstrations(env, 1, seed=seed) for seed in range(8)]
@@ -66,13 +66,14 @@ def test_two_processes_give_what_one_gives(tmp_path):
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
+    small = [*TINY, "--imitation-steps", 3]
     together = ["--distributed", "--coordinator", f"127.0.0.1:{port}", "--num-hosts", 2]
     runs = [
-        hindrl("train", "--out", tmp_path / "two", "--seeds", 2, *TINY, *together, "--host", 0),
-        hindrl("train", "--out", tmp_path / "two", "--seeds", 2, *TINY, *together, "--host", 1),
+        hindrl("train", "--out", tmp_path / "two", "--seeds", 2, *small, *together, "--host", 0),
+        hindrl("train", "--out", tmp_path / "two", "--seeds", 2, *small, *together, "--host", 1),
     ]
     try:
-        cli.main(["train", "--out", str(tmp_path / "one"), "--seeds", "2", *TINY])
+        cli.main(["train", "--out", str(tmp_path / "one"), "--seeds", "2", *map(str, small)])
         outputs = [run.communicate(timeout=300) for run in runs]
     finally:
         for run in runs:

@@ -12,6 +12,7 @@ from toy_env import Corridor, corridor_demonstrations
 import hindrl_jax as hindrl
 from hindrl_jax.core.rollout import Evaluation
 from hindrl_jax.runs.checkpoints import Checkpoints
+from hindrl_jax.training.experiment import Diverged
 from hindrl_jax.training.selection import CHOICE_ROUNDS, NUM_KEPT, Moment, Trial, better, choose, keep, nothing_kept
 
 NOBODY = np.zeros(1, bool)
@@ -263,6 +264,7 @@ def cloned():
 def test_a_clone_that_is_good_enough_is_returned_and_nothing_else_is_tried(cloned):
     assert (cloned.cloned_success == 1.0).all()
     assert (cloned.env_steps, cloned.updates, cloned.returned.env_steps.tolist()) == (0, 0, [0, 0])
+    assert [(row.env_steps, row.success) for row in cloned.rows] == [(0, 1.0), (0, 1.0)]  # the clone's evaluation, and none of what learnt nothing
     assert cloned.returned.actor["imitates"].tolist() == [1, 1]
     assert (cloned.returned.success == 1.0).all()
     summary = cloned.summaries()[0]
@@ -270,15 +272,23 @@ def test_a_clone_that_is_good_enough_is_returned_and_nothing_else_is_tried(clone
     assert summary.final_success == 1.0  # one that knows nothing, which learning would have begun with, arrives, too
 
 
+def test_a_clone_that_is_not_finite_ends_the_run():
+    demonstrations = easily_imitated()
+    spoilt = demonstrations.replace(actions=demonstrations.actions.at[0, 0].set(np.nan))
+    with pytest.raises(Diverged, match="the clone of the demonstrations of seed 3 is not finite"):
+        fit(CLONING, spoilt)
+
+
 def test_learning_goes_the_same_way_with_and_without_a_clone(tmp_path):
-    """Nothing is confirmed, and the run is killed and resumed after its first evaluation."""
+    """Nothing is confirmed, and the run is killed and resumed before its first evaluation."""
     config = dataclasses.replace(CLONING, stop_at=None, steps=80)
     without = fit(dataclasses.replace(config, imitation_steps=0), easily_imitated())
+    uninterrupted = fit(config, easily_imitated())
     checkpoints = Checkpoints(tmp_path, seconds=0)
 
     def report(result):
         checkpoints.save_when_due(result)
-        if result.rows:
+        if result.updates:
             raise Killed
 
     with pytest.raises(Killed):
@@ -286,6 +296,8 @@ def test_learning_goes_the_same_way_with_and_without_a_clone(tmp_path):
     resumed = fit(config, easily_imitated(), restore=Checkpoints(tmp_path).restore)
     assert (resumed.cloned_success == 1.0).all()
     assert without.cloned_success is None
+    assert resumed.evaluation_steps.tolist() == uninterrupted.evaluation_steps.tolist()
+    assert (resumed.evaluation_steps > without.evaluation_steps).all()
     for found, expected in zip(jax.tree.leaves(resumed.state.agent.actor), jax.tree.leaves(without.state.agent.actor), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5)
     kept = resumed.kept.actor["imitates"] * (resumed.kept.env_steps == 0) * (resumed.kept.success == 1.0)

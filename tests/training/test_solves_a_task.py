@@ -11,7 +11,7 @@ import sys
 
 def test_the_command_solves_the_fixed_grid(tmp_path):
     task = ["--env", "FixedGridPickAndPlace", "--demos", "100", "--seed", "700"]
-    length = ["--steps", "32000", "--stop-at", "0.95"]
+    length = ["--steps", "32000", "--stop-at", "0.95", "--imitation-steps", "0"]
     command = [sys.executable, "-m", "hindrl_jax", "train", *task, *length, "--out", str(tmp_path / "run")]
     environment = os.environ | {"XLA_FLAGS": "", "JAX_PLATFORMS": "cpu"}
     outcome = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600)
