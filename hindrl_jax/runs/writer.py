@@ -215,7 +215,7 @@ def _save_parameters(path: Path, result: Result) -> None:
     tree = {
         "policy": result.returned.actor,
         "policy_noise": np.asarray(result.returned.noise, np.float32),
-        "last_policy": policy(agent, result.config, average=True).actor,
+        "last_policy": policy(agent, result.configs[0], average=True).actor,
         "actor": agent.actor,
         **trained,
         "epsilon": result.guidance.epsilon,

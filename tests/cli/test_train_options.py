@@ -23,7 +23,7 @@ def test_options_that_change_nothing_are_warned_about():
     with pytest.warns(UserWarning, match="--num-quantiles 50 changes nothing: sac has no quantiles"):
         parse_train(["--base", "sac", "--num-quantiles", "50"])
     with pytest.warns(UserWarning, match="--bc-loss norm changes nothing: nothing is cloned"):
-        parse_train(["--bc-weight", "0", "--bc-loss", "norm"])
+        parse_train(["--bc-weight", "0", "--imitation-steps", "0", "--bc-loss", "norm"])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         parse_train(["--base", "sac", "--num-critics", "3"])

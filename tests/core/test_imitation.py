@@ -123,8 +123,8 @@ def test_the_imitation_is_cloned_and_all_else_stays_as_it_is():
     act = train.make_policy(agents.policy(state.agent, config, average=True, imitates=True), env, config)
     action = act(jax.random.key(0), data.demonstrations.observations[:, 0], data.demonstrations.desired_goals)
     np.testing.assert_allclose(action[:, 1], -0.5, atol=0.2)  # all demonstrated second actions
-    chex.assert_trees_all_equal(jax.tree.map(lambda leaf: leaf[-1], clones), state.agent.imitation)
-    of_each = [state.agent.replace(imitation=jax.tree.map(lambda leaf, part=part: leaf[part], clones)) for part in range(train.IMITATION_PARTS)]
+    chex.assert_trees_all_equal(clones[-1], state.agent.imitation)
+    of_each = [state.agent.replace(imitation=clone) for clone in clones]
     acts = [train.make_policy(agents.policy(agent, config, average=True, imitates=True), env, config) for agent in of_each]
     seen = data.demonstrations.observations[:, 0], data.demonstrations.desired_goals
     errors = [float(jnp.mean((act(jax.random.key(0), *seen)[:, 1] + 0.5) ** 2)) for act in acts]
