@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import copy
 import sys
 from collections.abc import Callable
 from types import UnionType
-from typing import Any, ClassVar, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+T = TypeVar("T")
 LARGEST = 2**31 - 1
 """The largest whole number that is counted to: counters are int32."""
+
+
+def unchecked(instance: T, **values: object) -> T:
+    """A copy of a frozen dataclass with other values, as `dataclasses.replace` makes one, but without its checks: a value may be traced."""
+    changed = copy.copy(instance)
+    for name, value in values.items():
+        object.__setattr__(changed, name, value)
+    return changed
 
 
 def check_types(instance: object) -> None:

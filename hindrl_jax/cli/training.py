@@ -74,9 +74,16 @@ def _summary_table(summary: dict[str, Any], config: TrainConfig) -> Table:
 
 def said_of_clones(seeds: Sequence[Mapping[str, Any]]) -> list[str]:
     """That some of the returned policies, those kept at step 0, are clones of the demonstrations, if they are; one line, or none."""
-    clones = [str(seed["seed"]) for seed in seeds if seed["returned_updates"] == 0]
-    which = "" if len(clones) == len(seeds) else f" of seed {', '.join(clones)}" if len(clones) == 1 else f" of seeds {', '.join(clones)}"
-    return [f"what was kept at step 0{which} is the clone of the demonstrations"] if clones else []
+    clones = [str(seed["seed"]) for seed in seeds if _is_clone(seed)]
+    if not clones:
+        return []
+    which = "" if len(clones) == len(seeds) else f" of seed{'s' if len(clones) > 1 else ''} {', '.join(clones)}"
+    return [f"what was kept at step 0{which} is the clone of the demonstrations"]
+
+
+def _is_clone(seed: Mapping[str, Any]) -> bool:
+    """Whether the policy that a seed returns was made before learning began."""
+    return bool(seed["returned_updates"] == 0)
 
 
 def said_of_never(seeds: Sequence[Mapping[str, Any]], rows: Sequence[Row]) -> list[str]:
@@ -91,8 +98,7 @@ def said_of_never(seeds: Sequence[Mapping[str, Any]], rows: Sequence[Row]) -> li
     """
     reached: dict[int, str] = {}
     for seed in seeds:
-        is_clone = seed["returned_updates"] == 0
-        if seed["updates_to_95"] is None and seed["returned_success"] >= SOLVED and not is_clone:
+        if seed["updates_to_95"] is None and seed["returned_success"] >= SOLVED and not _is_clone(seed):
             own = [row for row in rows if row.seed == seed["seed"] and row.sampled_success is not None]
             first = next((row for row in own if row.sampled_success >= SOLVED), None)
             if own:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Callable
 from typing import Any, Literal
 
-from hindrl_jax.base.checks import check, check_types
+from hindrl_jax.base.checks import check, check_types, unchecked
 
 RESIDUAL_EXPANSION = 4
 """Width inside a residual block, over that of the block."""
@@ -105,10 +104,7 @@ class AgentConfig:
     @property
     def for_imitation(self) -> AgentConfig:
         """The same with the network of bc, or one's own `actor_network`; not checked, since other values may be traced."""
-        agent = copy.copy(self)
-        object.__setattr__(agent, "net_arch", IMITATION_NET_ARCH)
-        object.__setattr__(agent, "residual", False)
-        return agent
+        return unchecked(self, net_arch=IMITATION_NET_ARCH, residual=False)
 
     @property
     def widest_layer(self) -> int:

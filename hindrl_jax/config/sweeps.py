@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Mapping
 from typing import Any, Literal
 
+from hindrl_jax.base.checks import unchecked
 from hindrl_jax.config.train import TrainConfig
 
 SWEEPABLE: dict[str, Literal["batch", "goal", "agent"]] = {
@@ -43,9 +43,7 @@ def with_values(config: TrainConfig, values: Mapping[str, Any]) -> TrainConfig:
 
 def with_traced_values(config: TrainConfig, values: Mapping[str, Any]) -> TrainConfig:
     """As `with_values`, for arrays or tracers in place of numbers: not checked, and neither hashable nor static. For use inside a program."""
-    config = copy.copy(config)
     for name, value in values.items():
-        section = copy.copy(getattr(config, SWEEPABLE[name]))
-        object.__setattr__(section, name, value)
-        object.__setattr__(config, SWEEPABLE[name], section)
+        section = SWEEPABLE[name]
+        config = unchecked(config, **{section: unchecked(getattr(config, section), **{name: value})})
     return config
