@@ -77,8 +77,10 @@ def said_of_clones(seeds: Sequence[Mapping[str, Any]]) -> list[str]:
     clones = [str(seed["seed"]) for seed in seeds if _is_clone(seed)]
     if not clones:
         return []
+    steps = max(seed.get("practice_steps", 0) for seed in seeds if _is_clone(seed))
+    practice = f", after up to {steps:,} steps of practice" if steps else ""
     which = "" if len(clones) == len(seeds) else f" of seed{'s' if len(clones) > 1 else ''} {', '.join(clones)}"
-    return [f"what was kept at step 0{which} is the clone of the demonstrations"]
+    return [f"what was kept at step 0{which} is the clone of the demonstrations{practice}"]
 
 
 def _is_clone(seed: Mapping[str, Any]) -> bool:

@@ -62,6 +62,7 @@ CONDITIONS: tuple[tuple[str, Callable[[TrainConfig], bool], str], ...] = (
         _relabels_with_demonstrations,
         "nothing is relabelled with goals of demonstrations: choose --algo hindrl with --hindrl-sampling-strategy task_conditioned",
     ),
+    ("practice_rounds", lambda c: c.imitation_steps > 0, "no policy imitates: raise --imitation-steps"),
     ("reach_zero", lambda c: c.batch.max_demo_rows > 0, "the batch has no demonstration rows: raise --max-demo-ratio"),
     ("bc_weight q_filter", _has_demo_rows, "the batch has no demonstration rows to clone: raise --max-demo-ratio"),
     (

@@ -51,6 +51,9 @@ class TrainConfig:
     imitation_steps: int = 0
     """Gradient steps of behaviour cloning at the start, rounded up to a multiple of 3, which make a second policy, with the network of bc. As it is
     after each third of them it may be returned; reinforcement learning begins and goes on without it. 0 for no such policy."""
+    practice_rounds: int = 0
+    """Rounds of practice of that policy, at most: it plays, and is cloned again from the demonstrations and the fastest of its episodes that solved
+    the task, for as long as it gets better (expert iteration; Anthony et al., 2017). 0 for none."""
     imitation_proposal: bool = False
     """That policy proposes an action beside the actor's: whichever the target critics value more is taken, in episodes, evaluations and targets
     (IBRL, Hu et al., 2024)."""
@@ -80,6 +83,7 @@ class TrainConfig:
             stop_at=(self.stop_at is None or 0.0 < self.stop_at <= 1.0, "greater than 0 and at most 1, or None"),
             learning_starts=(self.learning_starts >= 0, "0 or more"),
             demo_reset_ratio=(0.0 <= self.demo_reset_ratio <= 1.0, "between 0 and 1"),
+            practice_rounds=(0 <= self.practice_rounds <= LARGEST, f"between 0 and {LARGEST}"),
             imitation_steps=(0 <= self.imitation_steps <= LARGEST, f"between 0 and {LARGEST}"),
         )
         steps = self.num_steps if self.learns_from_rollouts else 0
@@ -95,6 +99,7 @@ class TrainConfig:
         if self.algo == "bc":
             given: dict[str, Any] = {
                 "imitation_steps": self.imitation_steps,
+                "practice_rounds": self.practice_rounds,
                 "imitation_proposal": self.imitation_proposal,
                 "q_filter": self.agent.q_filter != "off" and self.agent.q_filter,
                 "base": self.agent.base != "tqc" and self.agent.base,

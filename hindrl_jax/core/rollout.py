@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from hindrl_jax.base.environments import Restorable, Steppable, action_to_env
-from hindrl_jax.base.types import Array, TimeStep, tree_where
+from hindrl_jax.base.types import Array, Episodes, TimeStep, tree_where
 from hindrl_jax.core import curriculum
 from hindrl_jax.core.curriculum import Curriculum, Origin
 from hindrl_jax.core.goals import GoalTable, sample_goals
@@ -127,16 +127,51 @@ def evaluate(key: Array, env: Steppable, behavioural_goals: GoalTable, act: Act,
       num_episodes: played side by side.
     """
     key_reset, key_play = jax.random.split(key)
-    start = reset(key_reset, env, behavioural_goals, num_episodes)
-    result = Evaluation(success=jnp.zeros(num_episodes, bool), length=jnp.zeros(num_episodes, jnp.int32))
+    begun = reset(key_reset, env, behavioural_goals, num_episodes)
 
-    def one_step(carry: tuple[Array, Any, Array, Array, Evaluation], _: None) -> tuple[tuple[Array, Any, Array, Array, Evaluation], None]:
-        key, env_state, observation, over, result = carry
+    def outcome(observation: Array, action: Array, time_step: TimeStep, over: Array) -> tuple[Array, Array]:
+        return ~over & (time_step.reward > 0.0), ~over
+
+    (rewarded, taken), _ = _to_the_end(key_play, env, begun, act, outcome)
+    return Evaluation(success=jnp.any(rewarded, axis=0), length=jnp.sum(taken, axis=0, dtype=jnp.int32))
+
+
+def play(key: Array, env: Steppable, begun: RolloutState, act: Act) -> Episodes:
+    """Plays episodes from where they have begun to their end, and records them, without states.
+
+    Args:
+      key: random key.
+      env: static.
+      begun: the beginnings of E episodes.
+      act: the policy.
+    """
+
+    def row(observation: Array, action: Array, time_step: TimeStep, over: Array) -> tuple[Array, ...]:
+        return observation, action, jnp.where(over, 0.0, time_step.reward), ~over, time_step.terminated & ~over
+
+    rows, last = _to_the_end(key, env, begun, act, row)
+    observations, actions, rewards, taken, terminated = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), rows)
+    return Episodes(
+        observations=jnp.concatenate([observations, last[:, None]], axis=1),
+        actions=actions,
+        rewards=rewards,
+        lengths=jnp.sum(taken, axis=1, dtype=jnp.int32),
+        terminated=jnp.any(terminated, axis=1),
+        desired_goals=begun.desired_goal,
+    )
+
+
+def _to_the_end(key: Array, env: Steppable, begun: RolloutState, act: Act, note: Callable[[Array, Array, TimeStep, Array], Any]) -> tuple[Any, Array]:
+    """What `note` makes of each step (observation, action, time step, whether the episode was over before), leaves (T, E, ...), and where it ends."""
+
+    def one_step(carry: tuple[Array, Any, Array, Array], _: None) -> tuple[tuple[Array, Any, Array, Array], Any]:
+        key, env_state, observation, over = carry
         key, key_act = jax.random.split(key)
-        action = act(key_act, observation, start.desired_goal)
+        action = act(key_act, observation, begun.desired_goal)
         env_state, time_step = jax.vmap(env.step)(env_state, action_to_env(action, env))
-        result = Evaluation(success=result.success | (~over & (time_step.reward > 0.0)), length=result.length + ~over)
-        return (key, env_state, time_step.observation, over | time_step.terminated | time_step.truncated, result), None
+        after = (key, env_state, time_step.observation, over | time_step.terminated | time_step.truncated)
+        return after, note(observation, action, time_step, over)
 
-    carry = (key_play, start.env_state, start.observation, jnp.zeros(num_episodes, bool), result)
-    return jax.lax.scan(one_step, carry, length=env.horizon)[0][-1]
+    carry = (key, begun.env_state, begun.observation, jnp.zeros(begun.observation.shape[0], bool))
+    (_, _, last, _), notes = jax.lax.scan(one_step, carry, length=env.horizon)
+    return notes, last

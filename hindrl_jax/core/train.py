@@ -6,7 +6,7 @@ over its gradient steps.
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Callable
 from typing import cast
 
 import jax
@@ -18,7 +18,7 @@ from hindrl_jax.base.types import Array, TimeStep, Transition
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.core import agent as agents
 from hindrl_jax.core import curriculum, replay, rollout
-from hindrl_jax.core.agent import AgentState, Metrics, Params, Policy
+from hindrl_jax.core.agent import AgentState, Metrics, Policy
 from hindrl_jax.core.batch import goal_test, sample_batch, sample_demonstrations
 from hindrl_jax.core.curriculum import Curriculum
 from hindrl_jax.core.goals import nearby_goal
@@ -28,10 +28,6 @@ from hindrl_jax.core.inputs import network_inputs
 from hindrl_jax.core.replay import RecordedStep, ReplayState
 from hindrl_jax.core.rollout import Act, DemoResets, Evaluation, RolloutState
 from hindrl_jax.core.schedules import schedule
-
-IMITATION_PARTS = 3
-"""Times at which the policy that `imitate` clones is looked at: which is best differs by seed and task."""
-_IMITATION = 2**16  # the random numbers of `imitate` are none of those that a state's key gives when it is split
 
 
 class TrainState(struct.PyTreeNode, kw_only=True):
@@ -203,38 +199,22 @@ def gradient_steps(key: Array, state: TrainState, batches: Transition, env: Envi
 
 def clone(state: TrainState, guidance: Guidance, *, env: Environment, config: TrainConfig, num_iterations: int) -> tuple[TrainState, Metrics]:
     """`num_iterations` gradient steps of behaviour cloning on demonstration batches; no environment is stepped."""
+    return clone_from(state, lambda key: sample_demonstrations(key, guidance.demonstrations, env, config), env, config, num_iterations)
+
+
+def clone_from(
+    state: TrainState, draw: Callable[[Array], Transition], env: Environment, config: TrainConfig, num_iterations: int
+) -> tuple[TrainState, Metrics]:
+    """The same on the batches that `draw` gives for random keys."""
 
     def gradient_step(state: TrainState, _: None) -> tuple[TrainState, Metrics]:
         key, key_batch, key_update = jax.random.split(state.key, 3)
-        batch = sample_demonstrations(key_batch, guidance.demonstrations, env, config)
         moment = schedule(0.0, state.updates, config.agent, action_dim=env.action_dim)
-        agent, metrics = agents.update_bc(key_update, state.agent, batch, moment, config)
+        agent, metrics = agents.update_bc(key_update, state.agent, draw(key_batch), moment, config)
         return state.replace(agent=agent, key=key, updates=state.updates + 1), metrics
 
     state, metrics = jax.lax.scan(gradient_step, state, length=num_iterations)
     return state, jax.tree.map(jnp.mean, metrics)
-
-
-def imitate(state: TrainState, guidance: Guidance, *, env: Environment, config: TrainConfig) -> tuple[TrainState, list[Params]]:
-    """Clones a second policy by `imitation_steps` gradient steps; all else stays as it is, and so does what follows.
-
-    Returns:
-      The new state, and the policy's parameters after each of `IMITATION_PARTS` equal parts of the steps, the last of which are the state's, too.
-    """
-    cloning = dataclasses.replace(config, agent=config.agent.for_imitation)
-    start = state.replace(
-        agent=agents.with_actor(state.agent, state.agent.imitation),
-        key=jax.random.fold_in(state.key, _IMITATION),
-        updates=jnp.zeros_like(state.updates),
-    )
-
-    def part(state: TrainState, _: None) -> tuple[TrainState, Params]:
-        state, _metrics = clone(state, guidance, env=env, config=cloning, num_iterations=-(-config.imitation_steps // IMITATION_PARTS))
-        return state, state.agent.average_actor
-
-    cloned, clones = jax.lax.scan(part, start, length=IMITATION_PARTS)
-    parts = [jax.tree.map(lambda leaf, part=part: leaf[part], clones) for part in range(IMITATION_PARTS)]
-    return state.replace(agent=state.agent.replace(imitation=cloned.agent.average_actor)), parts
 
 
 def evaluate(key: Array, policy: Policy, guidance: Guidance, *, env: Steppable, config: TrainConfig, num_episodes: int) -> Evaluation:

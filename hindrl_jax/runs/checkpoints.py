@@ -37,6 +37,8 @@ LAYOUT = 3
 DEMONSTRATIONS = "demonstrations.npz"
 _ARRAYS = ("guidance", "state", "key", "kept")
 _COUNTERS = ("env_steps", "updates", "train_seconds")
+_OF_RUNS = ("cloned_success", "practised_success", "practice_steps")
+"""What a result has of each run, if it has it."""
 
 
 class Checkpoints:
@@ -81,7 +83,7 @@ class Checkpoints:
             "rows": [dataclasses.asdict(row) for row in result.rows],
             "chunks": [{name: [float(value) for value in values] for name, values in chunk.items()} for chunk in result.chunks],
             "evaluation_steps": [] if result.evaluation_steps is None else result.evaluation_steps.tolist(),
-            "cloned_success": None if result.cloned_success is None else result.cloned_success.tolist(),
+            **{name: None if (values := getattr(result, name)) is None else values.tolist() for name in _OF_RUNS},
             **{name: getattr(result, name) for name in _COUNTERS},
         }
         path = self.folder / str(result.steps_done)
@@ -118,6 +120,7 @@ class Checkpoints:
             arrays = checkpointer.restore(named, args=ocp.args.Composite(arrays=ocp.args.StandardRestore(target))).arrays
             leaves = [_as(shapes[name], arrays[name]) for name in shapes]
             guidance, state, key, kept = jax.tree.unflatten(jax.tree.structure(_trees(begun)), leaves)
+            of_runs: dict[str, Any] = {name: None if progress.get(name) is None else np.asarray(progress[name]) for name in _OF_RUNS}
             restored = dataclasses.replace(
                 begun,
                 guidance=guidance,
@@ -125,7 +128,7 @@ class Checkpoints:
                 key=key,
                 kept=kept,
                 evaluation_steps=np.asarray(progress["evaluation_steps"], np.int64) if progress["evaluation_steps"] else None,
-                cloned_success=None if progress.get("cloned_success") is None else np.asarray(progress["cloned_success"]),
+                **of_runs,
                 rows=[Row(**row) for row in progress["rows"]],
                 chunks=[{name: np.asarray(values, np.float32) for name, values in chunk.items()} for chunk in progress["chunks"]],
                 **{name: progress[name] for name in _COUNTERS},

@@ -92,7 +92,7 @@ def _default(algo: Algorithm, env: Environment) -> TrainConfig:
     if algo == "bc":
         agent = AgentConfig(net_arch=IMITATION_NET_ARCH)
         return TrainConfig(algo="bc", steps=1_500, eval_every=250, batch=BatchConfig(n_step=1), goal=goal, agent=agent)
-    return TrainConfig(imitation_steps=_IMITATION_STEPS, goal=goal, batch=_batch(env))
+    return TrainConfig(imitation_steps=_IMITATION_STEPS, practice_rounds=_PRACTICE_ROUNDS, goal=goal, batch=_batch(env))
 
 
 def _batch(env: Environment) -> BatchConfig:
@@ -123,6 +123,7 @@ def _rounded_down(value: float) -> float:
 
 
 _IMITATION_STEPS = 750  # by the cable tasks (docs/recipe.md, Imitation first)
+_PRACTICE_ROUNDS = 10  # it ends of itself, mostly sooner
 _FRAMEWORK: dict[str, Any] = dict(input_encoding="raw", actor_average_span=0.0, relative_value=False)
 """How the networks of the thesis's framework are fed, trained and evaluated."""
 

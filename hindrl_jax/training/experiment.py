@@ -15,7 +15,7 @@ from hindrl_jax.base.environments import Environment, can_step, holds_goal
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Episodes
 from hindrl_jax.config import TrainConfig
-from hindrl_jax.core.agent import Policy, policy
+from hindrl_jax.core.agent import Params, Policy, policy
 from hindrl_jax.core.holding import hold, hold_demonstrations, in_control_steps, with_action_hold
 from hindrl_jax.core.rollout import Evaluation
 from hindrl_jax.training.checks import check_config, check_memory, check_seeds, check_trainable, configs_per_seed, demonstrations_per_seed
@@ -28,6 +28,9 @@ from hindrl_jax.training.result import SAMPLED_SUCCESS, Result, Row
 from hindrl_jax.training.selection import Trial, better, choose, keep, nothing_kept
 
 Report = Callable[[Result], Any]
+RISING = 1.02
+"""Practice goes on while the score of a round, the mean worth of its attempts, is more than so many times the best before: gamma to the number of
+decisions until the goal, 0 for an attempt that does not solve the task."""
 
 
 class Diverged(UserError):
@@ -136,9 +139,7 @@ def _train(result: Result, programs: Programs, report: Report) -> None:
     """Takes the experiment from where it is to its end, all but the last report."""
     config, begins = result.config, result.steps_done == 0
     started = time.perf_counter() - result.train_seconds
-    if begins and config.imitation_steps > 0:
-        _imitate(result, programs, started)
-    ends = result.kept.all_confirmed
+    ends = _imitate(result, programs, report, started) if begins and config.imitation_steps > 0 else result.kept.all_confirmed
     if begins and config.learns_from_rollouts and not ends:
         result.state = jax.block_until_ready(programs.collect(result.state, result.guidance))
         result.env_steps = programs.steps_at_random
@@ -155,31 +156,61 @@ def _train(result: Result, programs: Programs, report: Report) -> None:
         if result.steps_done >= min(programs.steps_at_random + (evaluations_done + 1) * config.eval_every, config.num_steps):
             _evaluate(result, programs, started)
         result.train_seconds = time.perf_counter() - started
-        answer = report(result)
-        asked = isinstance(answer, bool | np.bool_) and bool(answer)  # not a tuple, say, of what several reporters return
-        ends = asked or result.kept.all_confirmed
+        ends = _asks_to_end(report(result)) or result.kept.all_confirmed
     if not result.rows:  # ended by `report` before the first evaluation
         _evaluate(result, programs, started)
     _finish(result, programs)
 
 
-def _imitate(result: Result, programs: Programs, started: float) -> None:
-    """Clones the demonstrations. What comes of it are the first policies that are kept."""
-    result.state, clones = programs.imitate(result.state, result.guidance)
-    finite = np.all([np.isfinite(leaf).all(axis=tuple(range(1, leaf.ndim))) for leaf in jax.tree.leaves(gather(clones[-1]))], axis=0)
+def _imitate(result: Result, programs: Programs, report: Report, started: float) -> bool:
+    """Clones the demonstrations, then practises for as long as that is of use. What comes of it are the first policies that are kept.
+
+    Returns:
+      Whether the experiment is to end.
+    """
+    config, practice = result.config, programs.no_practice()
+    score, best = np.zeros(len(result.seeds)), None
+    for rounds in range(config.practice_rounds + 1):
+        result.state, clones = programs.imitate(result.state, result.guidance, practice)
+        _check_clones(result, clones[-1])
+        for clone in clones if rounds == 0 else clones[-1:]:
+            policies = policy(result.state.agent.replace(imitation=clone), config, average=True, imitates=True)
+            evaluation = _played(result, programs, policies, config.eval_episodes)
+            best = evaluation if best is None else better(best, evaluation)[1]
+            if rounds == 0:
+                success = result.cloned_success = np.asarray(best.success).mean(axis=1)
+            else:
+                success = result.practised_success = np.asarray(evaluation.success).mean(axis=1)
+            result.train_seconds = time.perf_counter() - started
+            _keep(result, programs, policies, np.zeros(len(result.seeds)), evaluation)
+            if result.kept.all_confirmed:  # and so the run ends here
+                result.rows += _rows(result, best, {})
+                return True
+        if config.practice_rounds > 0 and _asks_to_end(report(result)):
+            return True
+        if rounds == config.practice_rounds or not success.any():
+            return False
+        practice, attempts = programs.practise(result.state, result.guidance, practice)
+        attempts = jax.device_get(gather(attempts))
+        steps = jax.device_get(in_control_steps(attempts, result.env, config.num_held).length)
+        result.practice_steps = result.practice_steps + steps.sum(axis=(1, 2), dtype=np.int64)
+        gammas = np.asarray([of_run.batch.gamma for of_run in result.configs])[:, None, None]
+        worth = np.where(attempts.solved, gammas**attempts.delay, 0.0).mean(axis=(1, 2))
+        if not (worth > RISING * score).any():
+            return False
+        score = np.maximum(score, worth)
+    return False
+
+
+def _asks_to_end(answer: Any) -> bool:
+    """Whether that is what a report has returned: not a tuple, say, of what several reporters return together."""
+    return isinstance(answer, bool | np.bool_) and bool(answer)
+
+
+def _check_clones(result: Result, clones: Params) -> None:
+    finite = np.all([np.isfinite(leaf).all(axis=tuple(range(1, leaf.ndim))) for leaf in jax.tree.leaves(gather(clones))], axis=0)
     if not finite.all():
         raise Diverged(f"the clone of the demonstrations of seed {result.seeds[int(np.argmin(finite))]} is not finite: try a lower learning_rate")
-    best: Evaluation | None = None
-    for clone in clones:
-        policies = policy(result.state.agent.replace(imitation=clone), result.config, average=True, imitates=True)
-        evaluation = _played(result, programs, policies, result.config.eval_episodes)
-        best = evaluation if best is None else better(best, evaluation)[1]
-        result.cloned_success = np.asarray(best.success).mean(axis=1)
-        result.train_seconds = time.perf_counter() - started
-        _keep(result, programs, policies, np.zeros(len(result.seeds)), evaluation)
-        if result.kept.all_confirmed:  # and so the run ends here
-            result.rows += _rows(result, best, {})
-            return
 
 
 def _evaluate(result: Result, programs: Programs, started: float) -> None:

@@ -25,10 +25,11 @@ from hindrl_jax.core import train as training
 from hindrl_jax.core.agent import Metrics, Params, Policy, policy
 from hindrl_jax.core.goals import sample_goals
 from hindrl_jax.core.guidance import Guidance
+from hindrl_jax.core.imitation import NOISES, NUM_STARTS, Attempts, Practice, with_attempt
 from hindrl_jax.core.rollout import Evaluation, RolloutState
 from hindrl_jax.core.train import TrainState
 from hindrl_jax.training.devices import by_seed, shapes_on
-from hindrl_jax.training.host_playing import HostPolicies, evaluate, with_goals_of
+from hindrl_jax.training.host_playing import HostPolicies, evaluate, record, with_goals_of, with_noise
 from hindrl_jax.training.programs import Programs, start
 
 
@@ -92,7 +93,7 @@ class HostPrograms(Programs):
                 pending["decide"] = compile_(deciding)
                 pending["decide_at_random"] = compile_(self._trace(decide, *planning, at_random=True))
             if config.imitation_steps > 0:
-                pending["imitate"] = compile_(self._trace(training.imitate, state, *rest, donate=True))
+                pending |= {name: compile_(program) for name, program in self._trace_imitation(state, *rest).items()}
             self._programs = {name: program.result() for name, program in pending.items()}
 
     def start(self, seeds: Array, demonstrations: Episodes) -> tuple[Guidance, TrainState, Array]:
@@ -108,8 +109,27 @@ class HostPrograms(Programs):
             state = self._stepped(state, plan, guidance)
         return state
 
-    def imitate(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, list[Params]]:
-        return self._programs["imitate"](state, guidance, self.values)
+    def imitate(self, state: TrainState, guidance: Guidance, practice: Practice) -> tuple[TrainState, list[Params]]:
+        return self._programs["imitate"](state, guidance, practice, self.values)
+
+    def practise(self, state: TrainState, guidance: Guidance, practice: Practice) -> tuple[Practice, Attempts]:
+        """As `core.imitation.practise`, a few starts after the other: as many as there are environments for each run."""
+        num_envs = self._shape[1]
+        stepper = with_goals_of(self._fresh, self.env, guidance.behavioural_goals)
+        imitating, key = policy(state.agent, self.config, average=True, imitates=True), _practice_keys(state.key, practice.rounds)
+        batches = []
+        for _ in range(-(-NUM_STARTS // num_envs)):
+            key, key_seeds, key_act = jnp.moveaxis(jax.vmap(functools.partial(jax.random.split, num=3))(key), 1, 0)
+            seeds = np.asarray(jax.vmap(lambda key: jax.random.bits(key, (num_envs,)))(key_seeds)).reshape(-1)
+            rng = np.random.default_rng(seeds)
+            act = self._policies.acting(key_act, imitating)
+            batches.append([self._by_seed(record(stepper, self.env, seeds, with_noise(act, self.env, noise, rng))) for noise in NOISES])
+        best, of_each = jax.tree.map(np.zeros_like, self.no_practice()).replace(rounds=np.asarray(practice.rounds) + 1), []
+        for attempt in zip(*batches, strict=True):
+            episodes = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1)[:, :NUM_STARTS], *attempt)
+            best, attempts = jax.vmap(with_attempt)(best, episodes)
+            of_each.append(attempts)
+        return self._put(best), jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *of_each)
 
     def learn(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, Metrics]:
         if self.stepper is None:
@@ -179,6 +199,11 @@ class HostPrograms(Programs):
 
 def _episodes(observation: Any, desired_goal: Any) -> RolloutState:
     return RolloutState(env_state=(), observation=observation, desired_goal=desired_goal)
+
+
+def _practice_keys(key: Array, rounds: Array) -> Array:
+    """(S,) keys of a round of practice, from the runs' own ones."""
+    return jax.vmap(lambda key, count: jax.random.fold_in(jax.random.fold_in(key, 8), count))(key, rounds)  # 8: see `_with_new_episodes`
 
 
 def _time_step_shapes(shape: tuple[int, ...], observation_dim: int) -> TimeStep:

@@ -125,6 +125,51 @@ def play(stepper: Stepper, seeds: np.ndarray, act: HostAct, num_episodes: int) -
     return success, length
 
 
+def with_noise(act: HostAct, env: Environment, noise: float, rng: np.random.Generator) -> HostAct:
+    """The policy with Gaussian noise on its actions, whose deviation counts in the range [-1, 1]."""
+    deviation = noise * (np.asarray(env.action_high) - np.asarray(env.action_low)) / 2.0
+
+    def noisy(observation: np.ndarray, desired_goal: np.ndarray) -> np.ndarray:
+        action = act(observation, desired_goal)
+        return np.clip(action + deviation * rng.standard_normal(action.shape), env.action_low, env.action_high).astype(np.float32)
+
+    return noisy
+
+
+def record(stepper: Stepper, env: Environment, seeds: np.ndarray, act: HostAct) -> Episodes:
+    """Plays one episode in each of N environments and records it, numpy leaves (N, ...), without states.
+
+    Args:
+      stepper: N environments of `env`.
+      env: the task, its actions held if they are.
+      seeds: (N,) uint32; equal ones begin equal episodes.
+      act: the policy.
+    """
+    observation, goal = stepper.begin(seeds)
+    over, steps = np.zeros(stepper.num_envs, bool), []
+    desired_goals, observations = goal, [observation]
+    while not over.all():
+        action = act(observation, goal)
+        outcome = stepper.step(action)
+        steps.append((played_action(env, action), outcome.success & ~over, ~over, outcome.terminated & ~over))
+        observations.append(outcome.next_observation)
+        over = over | outcome.ended
+        observation, goal = outcome.observation, outcome.desired_goal
+    actions, solved, taken, terminated = (np.stack(of_each, axis=1) for of_each in zip(*steps, strict=True))
+
+    def padded(rows: np.ndarray, size: int) -> np.ndarray:
+        return np.pad(rows, [(0, 0), (0, size - rows.shape[1]), *[(0, 0)] * (rows.ndim - 2)])
+
+    return Episodes(
+        observations=padded(np.stack(observations, axis=1), env.horizon + 1),
+        actions=padded(np.asarray(action_from_env(jnp.asarray(actions), env)), env.horizon),
+        rewards=padded(solved.astype(np.float32), env.horizon),
+        lengths=taken.sum(axis=1, dtype=np.int32),
+        terminated=terminated.any(axis=1),
+        desired_goals=desired_goals,
+    )
+
+
 def played_action(env: Environment, action: np.ndarray) -> np.ndarray:
     """What an environment makes of an action (..., A): bounded, and whole where it takes whole numbers."""
     own = getattr(env, "played_action", None)

@@ -1,4 +1,4 @@
-"""The compiled programs of an experiment: start, collect, imitate, learn, evaluate; each for all its runs at once.
+"""The compiled programs of an experiment: start, imitate, practise, collect, learn, evaluate; each for all its runs at once.
 
 `Programs` is what they have in common. `JaxPrograms` hold the whole loop, environments included; `host.HostPrograms` are the pieces between which
 environments are stepped outside JAX.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import abc
 import contextlib
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
@@ -19,10 +20,12 @@ from hindrl_jax.base.environments import Environment, Steppable, compiler_option
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.types import Array, Episodes
 from hindrl_jax.config import TrainConfig, sweepable_value, with_traced_values
+from hindrl_jax.core import imitation
 from hindrl_jax.core import train as training
 from hindrl_jax.core.agent import Metrics, Params, Policy, policy
 from hindrl_jax.core.guidance import Guidance
 from hindrl_jax.core.guidance import guidance as guidance_of
+from hindrl_jax.core.imitation import Attempts, Practice
 from hindrl_jax.core.rollout import Evaluation, RolloutState
 from hindrl_jax.core.train import TrainState
 from hindrl_jax.training.checks import steps_to_learn, swept_fields
@@ -84,8 +87,16 @@ class Programs(abc.ABC):
         """Fills the replay by random actions; the state is donated."""
 
     @abc.abstractmethod
-    def imitate(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, list[Params]]:
-        """Clones a second policy, see `core.train.imitate`; the state is donated."""
+    def imitate(self, state: TrainState, guidance: Guidance, practice: Practice) -> tuple[TrainState, list[Params]]:
+        """Clones a second policy, see `core.imitation.imitate`; the state is donated."""
+
+    @abc.abstractmethod
+    def practise(self, state: TrainState, guidance: Guidance, practice: Practice) -> tuple[Practice, Attempts]:
+        """Lets that policy play, see `core.imitation.practise`."""
+
+    def no_practice(self) -> Practice:
+        """Before the first round."""
+        return spread(jax.tree.map(lambda shape: np.zeros(shape.shape, shape.dtype), self._practice), self.mesh)
 
     @abc.abstractmethod
     def learn(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, Metrics]:
@@ -114,6 +125,13 @@ class Programs(abc.ABC):
             return function(*arguments, env=env, config=with_traced_values(config, values), **static)
 
         return jax.jit(over_seeds(of_one_run, self.mesh), donate_argnums=0 if donate else ()).trace(*shapes)
+
+    def _trace_imitation(self, state: Any, guidance: Any, values: Any) -> dict[str, Any]:
+        """The traced programs of the imitating policy that take place in JAX, whatever steps the environment."""
+        of_one_run = jax.eval_shape(functools.partial(imitation.no_practice, self.env))
+        num_runs = state.env_steps.shape[0]
+        self._practice = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((num_runs, *leaf.shape), leaf.dtype), of_one_run)
+        return {"imitate": self._trace(imitation.imitate, state, guidance, shapes_on(self._practice, self.mesh), values, donate=True)}
 
     def _trace_start(self, function: Callable[..., Any], *shapes: Any) -> tuple[Any, Any, Any, Any]:
         """The traced start, and the shapes of guidance, state and key, which fit into the memory.
@@ -156,7 +174,10 @@ class JaxPrograms(Programs):
             if config.learns_from_rollouts:
                 pending["collect"] = compile_(self._trace(training.collect, state, *rest, donate=True, num_iterations=self.warm_up), **_RUN_ONCE)
             if config.imitation_steps > 0:
-                pending["imitate"] = compile_(self._trace(training.imitate, state, *rest, donate=True))
+                traced = self._trace_imitation(state, *rest)
+                if config.practice_rounds > 0:
+                    traced["practise"] = self._trace(imitation.practise, state, guidance, shapes_on(self._practice, self.mesh), values)
+                pending |= {name: compile_(program) for name, program in traced.items()}
             self._programs = {name: program.result() for name, program in pending.items()}
 
     def start(self, seeds: Array, demonstrations: Episodes) -> tuple[Guidance, TrainState, Array]:
@@ -165,8 +186,11 @@ class JaxPrograms(Programs):
     def collect(self, state: TrainState, guidance: Guidance) -> TrainState:
         return self._programs["collect"](state, guidance, self.values)
 
-    def imitate(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, list[Params]]:
-        return self._programs["imitate"](state, guidance, self.values)
+    def imitate(self, state: TrainState, guidance: Guidance, practice: Practice) -> tuple[TrainState, list[Params]]:
+        return self._programs["imitate"](state, guidance, practice, self.values)
+
+    def practise(self, state: TrainState, guidance: Guidance, practice: Practice) -> tuple[Practice, Attempts]:
+        return self._programs["practise"](state, guidance, practice, self.values)
 
     def learn(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, Metrics]:
         return self._programs["learn"](state, guidance, self.values)

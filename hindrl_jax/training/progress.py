@@ -40,6 +40,7 @@ class ProgressBar:
         self._lines_said = 0
         self._last_is_said = True  # whether the newest evaluation has a line
         self._clone_is_said = False
+        self._practice_said = 0  # its steps when a line told of it
 
     @property
     def is_watched(self) -> bool:
@@ -51,10 +52,13 @@ class ProgressBar:
         tenths = math.floor(self._lines * result.steps_done / result.config.num_steps)
         if self._rows_seen is None or len(result.rows) < self._rows_seen:  # a training begins, or goes on after an interruption
             self._began, self._rows_seen, self._lines_said, self._last_is_said = None, len(result.rows), tenths, True
-            self._clone_is_said = False
+            self._clone_is_said, self._practice_said = False, int(result.practice_steps.sum())
         if result.cloned_success is not None and not self._clone_is_said:
             self._clone_is_said = True
             self.say(clone_line(result.cloned_success))
+        if result.practised_success is not None and not result.steps_done and result.practice_steps.sum() > self._practice_said:
+            self._practice_said = int(result.practice_steps.sum())
+            self.say(practice_line(result.practised_success, result.practice_steps))
         if len(result.rows) > self._rows_seen:
             self._rows_seen, self._last_is_said = len(result.rows), tenths > self._lines_said
             if self._last_is_said:
@@ -153,6 +157,12 @@ def clone_line(success: np.ndarray) -> str:
     """One line on the policies (S,) that were cloned at the start."""
     spread = f" (worst {success.min():.0%})" if len(success) > 1 else ""
     return f"a clone of the demonstrations solves {success.mean():.0%}{spread}; it is returned if nothing better is learnt"
+
+
+def practice_line(success: np.ndarray, steps: np.ndarray) -> str:
+    """One line on the same policies after practice of so many environment steps, both (S,)."""
+    spread = f" (worst {success.min():.0%})" if len(success) > 1 else ""
+    return f"after {steps.mean():,.0f} steps of practice {success.mean():.0%}{spread}"
 
 
 def evaluation_line(rows: Sequence[Row]) -> str:

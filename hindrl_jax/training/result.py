@@ -69,6 +69,10 @@ class SeedSummary:
     cloned_success: float | None
     """Share of an evaluation's episodes that the policy cloned at the start solves (`TrainConfig.imitation_steps`), the most of three; None where
     there is none. Where that one is returned, `returned_env_steps` is 0."""
+    practised_success: float | None
+    """The same after the last round of practice (`TrainConfig.practice_rounds`); None where there was none."""
+    practice_steps: int
+    """Environment steps of that practice; `env_steps` does not count them."""
     evaluation_steps: int
     """Environment steps that evaluations and the choice of the returned policy took; `env_steps` does not count them."""
 
@@ -101,6 +105,10 @@ class Result:
     """(S,) int, environment steps that evaluations took so far; None before the first."""
     cloned_success: np.ndarray | None = None
     """(S,) share of an evaluation's episodes that the policies cloned at the start solve, the most of three; None where there are none."""
+    practised_success: np.ndarray | None = None
+    """(S,) the same after the latest round of practice; None where there was none."""
+    practice_steps: np.ndarray | None = None
+    """(S,) int, environment steps of that practice, which `env_steps` does not count; zeros where none are given."""
     returned: Returned | None = None
     """The best policy of each run; None while the experiment is under way."""
     final_success: np.ndarray | None = None
@@ -111,6 +119,10 @@ class Result:
     """(S,) keys of the evaluations to come."""
     chunks: list[dict[str, np.ndarray]] = dataclasses.field(default_factory=list)
     """Metrics, leaves (S,), of the chunks since the last evaluation."""
+
+    def __post_init__(self) -> None:
+        if self.practice_steps is None:
+            self.practice_steps = np.zeros(len(self.seeds), np.int64)
 
     @property
     def config(self) -> TrainConfig:
@@ -158,6 +170,8 @@ class Result:
             kept=jax.tree.map(lambda leaf: leaf[runs], self.kept),
             returned=jax.tree.map(lambda leaf: leaf[runs], self.returned),
             cloned_success=None if self.cloned_success is None else self.cloned_success[runs],
+            practised_success=None if self.practised_success is None else self.practised_success[runs],
+            practice_steps=self.practice_steps[runs],
             evaluation_steps=self.evaluation_steps[runs],
             final_success=self.final_success[runs],
             final_length=self.final_length[runs],
@@ -180,5 +194,7 @@ class Result:
             seconds_to_95=None if first is None else first.seconds,
             episode_length=float(self.final_length[index]),
             cloned_success=None if self.cloned_success is None else float(self.cloned_success[index]),
+            practised_success=None if self.practised_success is None else float(self.practised_success[index]),
+            practice_steps=int(self.practice_steps[index]),
             evaluation_steps=int(self.evaluation_steps[index]),
         )

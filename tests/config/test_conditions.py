@@ -58,6 +58,7 @@ OF_THE_HOST = {
     "eval_every": "how many iterations are run between evaluations",
     "eval_episodes": "how many episodes an evaluation plays; it does not lead back to the policy",
     "stop_at": "ends the run",
+    "practice_rounds": "the loop over rounds is Python's",
     "action_chunks": "as action_hold",
     "action_hold": "the programs are given another environment and other demonstrations, and count steps by it",
 }

@@ -128,6 +128,7 @@ BAD = [
     (TrainConfig, "stop_at", [0.0, -0.1, 1.01]),
     (TrainConfig, "demo_reset_curriculum", [0.5, True]),  # True without resets to demonstrated states
     (TrainConfig, "imitation_steps", [-1, True, 2**31]),
+    (TrainConfig, "practice_rounds", [-1, True, 2**31]),
     (TrainConfig, "imitation_proposal", [1, True]),  # True without a policy that could propose
     (TrainConfig, "action_chunks", [1, None]),
     (TrainConfig, "buffer_size", [0, 1e6]),
@@ -190,6 +191,7 @@ def test_the_algorithm_must_fit_its_settings(fitting, contradiction, name):
     "changes",
     [
         dict(imitation_steps=1),
+        dict(practice_rounds=1),
         dict(imitation_proposal=True),
         dict(agent=AgentConfig(q_filter="hard")),
         dict(agent=AgentConfig(base="sac")),
@@ -234,6 +236,8 @@ def test_sources_of_relabelled_goals_by_hand(changes, sources):
         ({"batch": {"max_demo_ratio": 0.0}}, "bc_loss", "no demonstration rows to clone"),
         ({"batch": {"max_demo_ratio": 0.0}, "imitation_steps": 1}, "bc_loss", None),
         ({"agent": {"bc_weight": 0.0}}, "bc_action", "nothing is cloned"),
+        ({}, "practice_rounds", "no policy imitates"),
+        ({"imitation_steps": 1}, "practice_rounds", None),
         ({"algo": "bc"}, "bc_action", None),
         ({}, "learning_rate", None),
         ({"algo": "bc"}, "learning_rate", None),

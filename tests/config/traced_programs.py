@@ -12,7 +12,7 @@ from toy_env import Corridor, corridor_demonstrations
 
 from hindrl_jax.config import sweepable_value, with_traced_values
 from hindrl_jax.config.sweeps import SWEEPABLE
-from hindrl_jax.core import agent, train
+from hindrl_jax.core import agent, imitation, train
 from hindrl_jax.core.guidance import guidance
 
 ENV, DEMONSTRATIONS = Corridor(), corridor_demonstrations()
@@ -43,7 +43,7 @@ class Stages:
         return train.collect(state, data, **self.given(values), num_iterations=train.warm_up_iterations(ENV, self.config)), data
 
     def imitate(self, values, state, data):
-        return train.imitate(state, data, **self.given(values))[0], data
+        return imitation.imitate(state, data, imitation.no_practice(ENV), **self.given(values))[0], data
 
     def clone(self, values, state, data):
         return agent.policy(train.clone(state, data, **self.given(values), num_iterations=2)[0].agent, self.config, average=True)

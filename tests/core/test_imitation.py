@@ -13,16 +13,17 @@ from probe import ACTIONS, CONFIG, B, fresh_agent, make_batch, one_update, with_
 
 from hindrl_jax.config import BatchConfig
 from hindrl_jax.core import agent as agents
-from hindrl_jax.core import train
+from hindrl_jax.core import imitation, train
 
 CLONING = dataclasses.replace(CONFIG, imitation_steps=10)
 PROPOSING = dataclasses.replace(CLONING, imitation_proposal=True)
 
 
 def playing(actor, action, *, log_std=-5.0):
-    """An actor whose mode is `action` everywhere."""
+    """An actor whose mode is `action` in each dimension everywhere."""
     last = max(actor["params"])
-    last_layer = {"kernel": jnp.zeros_like(actor["params"][last]["kernel"]), "bias": jnp.array([np.arctanh(action), log_std], jnp.float32)}
+    kernel = jnp.zeros_like(actor["params"][last]["kernel"])
+    last_layer = {"kernel": kernel, "bias": jnp.repeat(jnp.array([np.arctanh(action), log_std], jnp.float32), kernel.shape[1] // 2)}
     return {"params": {**actor["params"], last: last_layer}}
 
 
@@ -118,7 +119,7 @@ def test_the_imitation_is_cloned_and_all_else_stays_as_it_is():
     config = make_config(agent=agent, imitation_steps=300, batch=BatchConfig(batch_size=32))
     data, env = make_data(config), make_env()
     start = train.init(jax.random.key(0), data, env, config)
-    state, clones = jax.jit(functools.partial(train.imitate, env=env, config=config))(start, data)
+    state, clones = jax.jit(functools.partial(imitation.imitate, env=env, config=config))(start, data, imitation.no_practice(env))
     chex.assert_trees_all_equal(*(each.replace(agent=each.agent.replace(imitation=None)) for each in (state, start)))
     act = train.make_policy(agents.policy(state.agent, config, average=True, imitates=True), env, config)
     action = act(jax.random.key(0), data.demonstrations.observations[:, 0], data.demonstrations.desired_goals)
@@ -129,3 +130,86 @@ def test_the_imitation_is_cloned_and_all_else_stays_as_it_is():
     seen = data.demonstrations.observations[:, 0], data.demonstrations.desired_goals
     errors = [float(jnp.mean((act(jax.random.key(0), *seen)[:, 1] + 0.5) ** 2)) for act in acts]
     assert errors[0] > errors[-1]
+
+
+def played(env, *, delays, lengths=None, marks=0.0):
+    """Episodes of 3 steps whose rewards begin after so many; -1 for none at all. Their first actions are the mark."""
+    steps, delays = jnp.arange(env.horizon)[None], jnp.array(delays)[:, None]
+    lengths = jnp.full(len(delays), 3) if lengths is None else jnp.array(lengths)
+    table = imitation.no_practice(env).episodes
+    table = jax.tree.map(lambda leaf: leaf[: len(delays)], table)
+    rewards = jnp.where((delays >= 0) & (steps >= delays) & (steps < lengths[:, None]), 1.0, 0.0)
+    return table.replace(rewards=rewards, lengths=lengths.astype(jnp.int32), actions=table.actions.at[:, 0, 0].set(marks))
+
+
+def test_the_fastest_solved_attempt_at_each_start_is_remembered():
+    env = make_env()
+    best = jax.tree.map(lambda leaf: leaf[:4] if leaf.ndim else leaf, imitation.no_practice(env))
+    assert not best.solved.any()
+    outcomes = []
+    for mark, delays in enumerate([(2, -1, 1, -1), (1, 2, 1, -1), (2, 1, 0, -1)], start=1):
+        best, attempts = imitation.with_attempt(best, played(env, delays=delays, marks=mark))
+        outcomes.append(attempts)
+    assert best.solved.tolist() == [True, True, True, False]
+    assert best.episodes.actions[:3, 0, 0].tolist() == [2.0, 3.0, 3.0]
+    assert outcomes[0].solved.tolist() == [True, False, True, False]
+    assert outcomes[0].delay.tolist() == [2, 3, 1, 3]
+    best, _ = imitation.with_attempt(best, played(env, delays=(1, 1, 0, -1), marks=9.0))  # no faster
+    assert best.episodes.actions[:3, 0, 0].tolist() == [2.0, 3.0, 3.0]
+
+
+def test_an_attempt_that_leaves_its_goal_is_not_solved():
+    env = make_env()
+    episodes = played(env, delays=(1, 1))
+    episodes = episodes.replace(rewards=episodes.rewards.at[0, 2].set(0.0))
+    best = jax.tree.map(lambda leaf: leaf[:2] if leaf.ndim else leaf, imitation.no_practice(env))
+    best, attempts = imitation.with_attempt(best, episodes)
+    assert best.solved.tolist() == attempts.solved.tolist() == [False, True]
+    assert attempts.delay.tolist() == [2, 1]
+
+
+def test_what_was_solved_is_cloned_beside_the_demonstrations_and_nothing_else():
+    """Demonstrations and episodes of practice are drawn alike; in the place of one that did not solve the task a demonstration is."""
+    config = make_config(imitation_steps=3, batch=BatchConfig(batch_size=64))
+    data, env = make_data(config), make_env()
+    practice = imitation.no_practice(env)
+    size = practice.solved.shape[0]
+    practice = practice.replace(
+        episodes=practice.episodes.replace(actions=jnp.where(jnp.arange(size) % 2 == 0, 0.25, -0.75)[:, None, None] + practice.episodes.actions),
+        solved=jnp.arange(size) % 2 == 0,
+    )
+    examples = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), data.demonstrations, practice.episodes)
+    draw = jax.jit(jax.vmap(lambda key: imitation._sample_examples(key, examples, practice.solved, env, config)))
+    actions = draw(jax.random.split(jax.random.key(0), 200)).action[..., 1]
+    num_demos = data.demonstrations.lengths.shape[0]
+    assert not (actions == -0.75).any()
+    np.testing.assert_allclose((actions == 0.25).mean(), size / 2 / (num_demos + size), atol=0.01)
+    np.testing.assert_allclose((actions == -0.5).mean(), 1.0 - size / 2 / (num_demos + size), atol=0.01)  # all demonstrated second actions
+
+
+def test_practice_plays_each_start_several_times_and_its_episodes_are_what_the_environment_makes_of_their_actions():
+    config = make_config(imitation_steps=3)
+    data, env = make_data(config), make_env()
+    state = train.init(jax.random.key(0), data, env, config)
+    state = state.replace(agent=state.agent.replace(imitation=playing(state.agent.imitation, 0.0)))  # 5 steps of 1, for more than 4
+    practise = jax.jit(functools.partial(imitation.practise, env=env, config=config))
+    practice, attempts = practise(state, data, imitation.no_practice(env))
+    assert int(practice.rounds) == 1
+    assert attempts.solved.shape == attempts.length.shape == attempts.delay.shape == (len(imitation.NOISES), imitation.NUM_STARTS)
+    np.testing.assert_array_equal(practice.solved, attempts.solved.any(axis=0))
+    assert attempts.solved[0].all()
+    fastest = jnp.where(attempts.solved, attempts.delay, env.horizon).min(axis=0)
+    np.testing.assert_array_equal(practice.episodes.lengths - 1, fastest)
+    assert (fastest < attempts.delay[0]).any()  # noise helps here and there
+    episodes = jax.device_get(practice.episodes)
+    assert len(np.unique(episodes.observations[:, 0])) > imitation.NUM_STARTS // 2
+    for row in range(3):
+        start = jnp.array([episodes.observations[row, 0, 0], 0.0, 0.0])
+        state_of_env = env.vector_to_state(jax.random.key(0), start)
+        for step in range(int(episodes.lengths[row])):
+            state_of_env, time_step = env.step(state_of_env, 1.0 + episodes.actions[row, step])
+            np.testing.assert_allclose(time_step.observation, episodes.observations[row, step + 1], atol=1e-5)
+            assert float(time_step.reward) == episodes.rewards[row, step]
+    again, _ = practise(state, data, practice)
+    assert int(again.rounds) == 2
+    assert not np.array_equal(again.episodes.observations[:, 0], episodes.observations[:, 0])  # other starts

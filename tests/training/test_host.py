@@ -18,9 +18,10 @@ from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.steppers import SimulationFailed
 from hindrl_jax.core.batch import rows_of_demonstrations
 from hindrl_jax.core.hindsight import NEARBY_GOAL
+from hindrl_jax.core.imitation import NOISES, NUM_STARTS
 from hindrl_jax.runs.checkpoints import Checkpoints
 from hindrl_jax.tasks.simulators import Simulators
-from hindrl_jax.training.host_playing import play
+from hindrl_jax.training.host_playing import play, record, with_noise
 from hindrl_jax.training.judging import as_judged_by
 from hindrl_jax.training.recording import record_gymnasium
 
@@ -66,6 +67,46 @@ def test_demonstrations_that_stay_at_their_goal_serve_where_the_episode_ends_the
     np.testing.assert_array_equal(cut.rewards, np.arange(10) == cut.lengths[:, None] - 1)
     np.testing.assert_array_equal(cut.observations, recorded.observations)
     hindrl.fit(env, recorded, dataclasses.replace(CONFIG, steps=60, eval_every=20))  # the same in memory
+
+
+def towards_goal(observation, goal):
+    """A policy that walks straight to its goal, not as fast as it may, in the environment's own units."""
+    return np.clip(np.asarray(goal) - observation[:, :2], -0.5 * SPEED, 0.5 * SPEED)
+
+
+def test_recorded_episodes_are_what_the_environment_makes_of_their_actions(env):
+    """Noisy ones, with equal seeds from equal starts."""
+    stepper, rng, seeds = env.stepper(3), np.random.default_rng(0), np.arange(3, dtype=np.uint32)
+    try:
+        first, second = (record(stepper, env, seeds, with_noise(towards_goal, env, noise, rng)) for noise in (0.0, 0.3))
+    finally:
+        stepper.close()
+    np.testing.assert_array_equal(first.observations[:, 0], second.observations[:, 0])
+    np.testing.assert_array_equal(first.desired_goals, second.desired_goals)
+    assert (first.actions != second.actions).any()
+    for episodes in (first, second):
+        assert np.abs(episodes.actions).max() <= 1.0
+        for row, length in enumerate(episodes.lengths):
+            places = episodes.observations[row, : length + 1, :2]
+            np.testing.assert_allclose(np.diff(places, axis=0), SPEED * episodes.actions[row, :length], atol=1e-5)
+            reached = np.linalg.norm(places[1:] - episodes.desired_goals[row], axis=1) <= 0.2
+            np.testing.assert_array_equal(episodes.rewards[row, :length] > 0.0, reached)
+            assert episodes.terminated[row] == reached[-1]
+            assert not episodes.rewards[row, length:].any()
+
+
+@pytest.mark.parametrize("success", ["reached", "held"])
+def test_a_clone_practises_where_environments_are_stepped_outside_jax(env, success):
+    """Three environments for each run, so that the last starts of a round are fewer than these."""
+    judged = dataclasses.replace(env, success=success)
+    config = dataclasses.replace(CONFIG, imitation_steps=90, practice_rounds=2, num_envs=3, steps=120)
+    result = hindrl.fit(judged, record_gymnasium(judged, to_goal, 5, seed=1), config, seeds=[0, 1])
+    assert (result.practised_success >= 0.5).any()
+    attempts = NUM_STARTS * len(NOISES)
+    assert ((result.practice_steps >= attempts) & (result.practice_steps <= 2 * 10 * attempts)).all()
+    assert success == "reached" or (result.practice_steps % (10 * attempts) == 0).all()  # held to the horizon
+    for name, value in (("practised_success", result.practised_success), ("practice_steps", result.practice_steps)):
+        assert [getattr(summary, name) for summary in result.summaries()] == value.tolist()
 
 
 @pytest.mark.parametrize("num_held", [1, 3])

@@ -37,6 +37,8 @@ def result(done, *, every=100, seeds=(0, 1), algo="hindrl", finished=False, clon
         train_seconds=done / 100,
         final_success=np.zeros(len(seeds)) if finished else None,
         cloned_success=cloned,
+        practised_success=None,
+        practice_steps=np.zeros(len(seeds), int),
         latest_success=lambda: float(np.mean([row.success for row in rows[-len(seeds) :]])) if rows else None,
     )
 
@@ -66,6 +68,19 @@ def test_a_log_file_gets_ten_plain_lines():
 def test_what_sampled_actions_solve_stands_beside():
     rows = [dataclasses.replace(row, metrics={"evaluation/sampled_success": share}) for row, share in zip(result(100).rows, (1.0, 0.5), strict=True)]
     assert evaluation_line(rows) == "      100 steps      100 updates     1.0 s   success   2% (worst   1%)   sampled  75%   length  50.0"
+
+
+def test_each_round_of_practice_has_a_line():
+    screen, rounds = console(), [(0, None), (0, None), (1_000, [0.5, 0.75]), (1_000, [0.5, 0.75]), (2_500, [1.0, 0.75]), (4_000, [1.0, 0.75])]
+    progress = hindrl.ProgressBar(console=screen)
+    for index, (steps, success) in enumerate(rounds):
+        present = result(0 if index < 5 else 50, cloned=np.array([0.5, 0.5]))  # the last round was no use, so learning begins
+        present.practice_steps, present.practised_success = np.full(2, steps), None if success is None else np.array(success)
+        progress(present)
+    assert screen.file.getvalue().splitlines()[1:] == [
+        "after 1,000 steps of practice 62% (worst 50%)",
+        "after 2,500 steps of practice 88% (worst 75%)",
+    ]
 
 
 @pytest.mark.parametrize(

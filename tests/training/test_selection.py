@@ -1,6 +1,7 @@
 """Which policies of a run are kept, which of them is returned, and what ends a run."""
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import tiny
 from toy_env import Corridor, corridor_demonstrations
 
 import hindrl_jax as hindrl
+from hindrl_jax.core.imitation import NOISES, NUM_STARTS
 from hindrl_jax.core.rollout import Evaluation
 from hindrl_jax.runs.checkpoints import Checkpoints
 from hindrl_jax.training.experiment import Diverged
@@ -270,6 +272,42 @@ def test_a_clone_that_is_good_enough_is_returned_and_nothing_else_is_tried(clone
     summary = cloned.summaries()[0]
     assert (summary.cloned_success, summary.returned_env_steps, summary.returned_updates) == (1.0, 0, 0)
     assert summary.final_success == 1.0  # one that knows nothing, which learning would have begun with, arrives, too
+
+
+def test_practice_makes_a_clone_faster_than_its_demonstrations():
+    """Both walk slowly, the corridor's end can be reached sooner, and nothing is learnt but by practice."""
+    demonstrations = corridor_demonstrations((0.65, 0.65))
+    walking = demonstrations.replace(observations=demonstrations.observations.at[:, :, 0].set(jnp.array([[0.2], [0.8]])))
+    said = []
+    config = dataclasses.replace(CLONING, stop_at=None, practice_rounds=4, steps=80)
+    result = fit(config, walking, report=lambda result: said.append((result.env_steps, result.practised_success, result.practice_steps.copy())))
+    before = fit(dataclasses.replace(config, practice_rounds=0), walking)
+    assert before.practised_success is None
+    assert before.practice_steps.tolist() == [0, 0]
+    assert (result.cloned_success == before.cloned_success).all()
+    assert (result.practised_success == 1.0).all()
+    lengths = [kept.length[kept.actor["imitates"] == 1].min() for kept in (before.kept, result.kept)]
+    assert lengths[1] < lengths[0] - 0.5
+    fewest = NUM_STARTS * len(NOISES)  # of a round, one step for each attempt
+    assert ((result.practice_steps > 2 * fewest) & (result.practice_steps <= 4 * fewest * 5)).all()
+    rounds = [steps for done, _, steps in said if not done]
+    assert all((later >= sooner).all() for sooner, later in itertools.pairwise(rounds))
+    assert [summary.practice_steps for summary in result.summaries()] == result.practice_steps.tolist()
+    # Learning goes on as it would have without.
+    for found, expected in zip(jax.tree.leaves(result.state.agent.actor), jax.tree.leaves(before.state.agent.actor), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5)
+
+
+def test_practice_ends_where_it_is_of_no_use_and_where_a_report_says_so():
+    """No clone of demonstrations that stand still ever arrives."""
+    standing = easily_imitated()
+    standing = standing.replace(actions=jnp.full_like(standing.actions, -1.0))
+    config = dataclasses.replace(CLONING, stop_at=None, practice_rounds=3, steps=80)
+    result = fit(config, standing)
+    assert (result.cloned_success.tolist(), result.practised_success, result.practice_steps.tolist()) == ([0.0, 0.0], None, [0, 0])
+    ended = fit(config, easily_imitated(), report=lambda result: result.cloned_success is not None)
+    assert (ended.env_steps, ended.practised_success) == (0, None)
+    assert (ended.returned.success == 1.0).all()
 
 
 def test_a_clone_that_is_not_finite_ends_the_run():
