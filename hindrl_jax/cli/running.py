@@ -166,9 +166,10 @@ def run(
 
 def speed_line(summary: dict[str, Any]) -> str:
     """How fast a training was, from its summary."""
+    rates = f"{summary['updates_per_second']:,.0f} updates/s" if summary["updates_per_second"] else "nothing was learnt but clones"
     env_steps = f" and {summary['env_steps_per_second']:,.0f} environment steps/s" if summary["env_steps_per_second"] else ""
     return (
-        f"{summary['updates_per_second']:,.0f} updates/s{env_steps} over all seeds, "
+        f"{rates}{env_steps} over all seeds, "
         f"{summary['train_seconds']:.1f} s of training after {summary['compile_seconds']:.1f} s of compilation, "
         f"peak memory {summary['peak_memory_bytes'] / 2**20:,.0f} MiB"
     )

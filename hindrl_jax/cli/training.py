@@ -73,14 +73,14 @@ def _summary_table(summary: dict[str, Any], config: TrainConfig) -> Table:
 
 
 def said_of_clones(seeds: Sequence[Mapping[str, Any]]) -> list[str]:
-    """That some of the returned policies, those kept at step 0, are clones of the demonstrations, if they are; one line, or none."""
+    """That some of the returned policies are clones of the demonstrations, if they are; one line, or none."""
     clones = [str(seed["seed"]) for seed in seeds if _is_clone(seed)]
     if not clones:
         return []
-    steps = max(seed.get("practice_steps", 0) for seed in seeds if _is_clone(seed))
-    practice = f", after up to {steps:,} steps of practice" if steps else ""
+    practised = any(seed["returned_env_steps"] for seed in seeds if _is_clone(seed))
+    when, practice = ("", ", and its steps are those of its practice") if practised else (" at step 0", "")
     which = "" if len(clones) == len(seeds) else f" of seed{'s' if len(clones) > 1 else ''} {', '.join(clones)}"
-    return [f"what was kept at step 0{which} is the clone of the demonstrations{practice}"]
+    return [f"what was kept{when}{which} is the clone of the demonstrations{practice}"]
 
 
 def _is_clone(seed: Mapping[str, Any]) -> bool:

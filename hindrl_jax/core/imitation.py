@@ -29,7 +29,7 @@ from hindrl_jax.core.replay import sample_steps
 from hindrl_jax.core.rollout import Act
 from hindrl_jax.core.train import TrainState, clone_from
 
-PARTS = 3
+NUM_PARTS = 3
 """Times at which the first clone is looked at: which is best differs by seed and task."""
 NUM_STARTS = 32
 """Starts of a round of practice."""
@@ -43,7 +43,7 @@ class Practice(struct.PyTreeNode, kw_only=True):
 
     episodes: Episodes  # M
     solved: Array  # (M,) bool, whether there is one
-    rounds: Array  # () int32, how often was practised
+    num_rounds: Array  # () int32, rounds so far
 
 
 class Attempts(struct.PyTreeNode, kw_only=True):
@@ -64,11 +64,13 @@ def no_practice(env: Environment) -> Practice:
         terminated=jnp.zeros(NUM_STARTS, bool),
         desired_goals=jnp.zeros((NUM_STARTS, env.goal_dim)),
     )
-    return Practice(episodes=episodes, solved=jnp.zeros(NUM_STARTS, bool), rounds=jnp.zeros((), jnp.int32))
+    return Practice(episodes=episodes, solved=jnp.zeros(NUM_STARTS, bool), num_rounds=jnp.zeros((), jnp.int32))
 
 
 def imitate(state: TrainState, guidance: Guidance, practice: Practice, *, env: Environment, config: TrainConfig) -> tuple[TrainState, list[Params]]:
-    """`imitation_steps` gradient steps of cloning, of the imitating policy; all else stays as it is, and so does what follows.
+    """`imitation_steps` gradient steps of cloning, of the imitating policy; all else stays as it is.
+
+    So does what follows, unless that policy proposes actions in it (`imitation_proposal`).
 
     Args:
       state: a run that has not begun to learn.
@@ -77,14 +79,14 @@ def imitate(state: TrainState, guidance: Guidance, practice: Practice, *, env: E
       env, config: static.
 
     Returns:
-      The new state, and the policy's parameters after each of `PARTS` equal parts of the steps, the last of which are the state's, too.
+      The new state, and the policy's parameters after each of `NUM_PARTS` equal parts of the steps, the last of which are the state's, too.
     """
     cloning = dataclasses.replace(config, agent=config.agent.for_imitation)
     demonstrations = _as_long_as(guidance.demonstrations, practice.episodes)
     examples = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), demonstrations, practice.episodes)
     start = state.replace(
         agent=agents.with_actor(state.agent, state.agent.imitation),
-        key=jax.random.fold_in(state.key, _CLONING + practice.rounds),
+        key=jax.random.fold_in(state.key, _CLONING + practice.num_rounds),
         updates=jnp.zeros_like(state.updates),
     )
 
@@ -92,11 +94,11 @@ def imitate(state: TrainState, guidance: Guidance, practice: Practice, *, env: E
         return _sample_examples(key, examples, practice.solved, env, cloning)
 
     def part(state: TrainState, _: None) -> tuple[TrainState, Params]:
-        state, _metrics = clone_from(state, draw, env, cloning, -(-config.imitation_steps // PARTS))
+        state, _metrics = clone_from(state, draw, env, cloning, -(-config.imitation_steps // NUM_PARTS))
         return state, state.agent.average_actor
 
-    cloned, clones = jax.lax.scan(part, start, length=PARTS)
-    parts = [jax.tree.map(lambda leaf, part=part: leaf[part], clones) for part in range(PARTS)]
+    cloned, clones = jax.lax.scan(part, start, length=NUM_PARTS)
+    parts = [jax.tree.map(lambda leaf, part=part: leaf[part], clones) for part in range(NUM_PARTS)]
     return state.replace(agent=state.agent.replace(imitation=cloned.agent.average_actor)), parts
 
 
@@ -129,7 +131,7 @@ def practise(state: TrainState, guidance: Guidance, practice: Practice, *, env: 
       practice: of the rounds before, which are forgotten.
       env, config: static.
     """
-    key = jax.random.fold_in(jax.random.fold_in(state.key, _PRACTICE), practice.rounds)
+    key = jax.random.fold_in(jax.random.fold_in(state.key, _PRACTICE), practice.num_rounds)
     key_start, key_attempts = (jax.random.fold_in(key, index) for index in (0, 1))
 
     def attempt(best: Practice, given: tuple[Array, Array]) -> tuple[Practice, Attempts]:
@@ -139,7 +141,7 @@ def practise(state: TrainState, guidance: Guidance, practice: Practice, *, env: 
         return with_attempt(best, episodes)
 
     given = (jnp.arange(len(NOISES)), jnp.asarray(NOISES))
-    return jax.lax.scan(attempt, no_practice(env).replace(rounds=practice.rounds + 1), given)
+    return jax.lax.scan(attempt, no_practice(env).replace(num_rounds=practice.num_rounds + 1), given)
 
 
 def _noisy(agent: AgentState, noise: Array, env: Environment, config: TrainConfig) -> Act:

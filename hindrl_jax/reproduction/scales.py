@@ -131,7 +131,7 @@ def _config(setting: Setting, recipe: Recipe, scale: ScaleName) -> TrainConfig:
         return changed(config, of_scale.cloning)
     weight: Changes = () if setting.bc_weight is None else (("agent.bc_weight", setting.bc_weight),)
     # The thesis compares methods: what reinforcement learning finds, not the clone that a run of ours would return where that is better.
-    return changed(config, (*(of_scale.ours if recipe == "default" else of_scale.theirs), *weight, ("imitation_steps", 0)))
+    return changed(config, (*(of_scale.ours if recipe == "default" else of_scale.theirs), *weight, ("imitation_steps", 0), ("practice_rounds", 0)))
 
 
 SHARE_OF_HORIZON = 0.9

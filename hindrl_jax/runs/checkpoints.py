@@ -84,6 +84,7 @@ class Checkpoints:
             "chunks": [{name: [float(value) for value in values] for name, values in chunk.items()} for chunk in result.chunks],
             "evaluation_steps": [] if result.evaluation_steps is None else result.evaluation_steps.tolist(),
             **{name: None if (values := getattr(result, name)) is None else values.tolist() for name in _OF_RUNS},
+            "imitation_seconds": result.imitation_seconds,
             **{name: getattr(result, name) for name in _COUNTERS},
         }
         path = self.folder / str(result.steps_done)
@@ -131,6 +132,7 @@ class Checkpoints:
                 **of_runs,
                 rows=[Row(**row) for row in progress["rows"]],
                 chunks=[{name: np.asarray(values, np.float32) for name, values in chunk.items()} for chunk in progress["chunks"]],
+                imitation_seconds=progress.get("imitation_seconds", 0.0),
                 **{name: progress[name] for name in _COUNTERS},
             )
         self.steps, self._saved_at = restored.steps_done, time.monotonic()

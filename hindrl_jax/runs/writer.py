@@ -185,14 +185,18 @@ def save_run(path: str | os.PathLike[str], result: Result, *, demos: str = FROM_
 
 
 def summarise(result: Result) -> dict[str, Any]:
-    """The contents of `summary.json`. Rates are those of the result's own seeds; other settings of a sweep ran beside them in the same time."""
-    seconds, num_seeds = result.train_seconds, len(result.seeds)
+    """The contents of `summary.json`.
+
+    Rates are those of learning, without the cloning and practice before it, and of the result's own seeds; other settings of a sweep ran beside them
+    in the same time.
+    """
+    learning, num_seeds = max(result.train_seconds - result.imitation_seconds, 1e-9), len(result.seeds)
     return {
         "seeds": [dataclasses.asdict(seed) for seed in result.summaries()],
-        "updates_per_second": num_seeds * result.updates / seconds,
-        "env_steps_per_second": num_seeds * result.env_steps / seconds,
+        "updates_per_second": num_seeds * result.updates / learning,
+        "env_steps_per_second": num_seeds * result.env_steps / learning,
         "compile_seconds": result.compile_seconds,
-        "train_seconds": seconds,
+        "train_seconds": result.train_seconds,
         "peak_memory_bytes": peak_memory_bytes(),
     }
 

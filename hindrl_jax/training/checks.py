@@ -19,6 +19,7 @@ from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.base.steppers import can_step_on_host, gives_goals
 from hindrl_jax.base.types import Episodes
 from hindrl_jax.config import IMITATION_NET_ARCH, RESIDUAL_EXPANSION, SWEEPABLE, TrainConfig, sweepable_value, with_traced_values
+from hindrl_jax.core.imitation import NUM_STARTS
 from hindrl_jax.core.train import warm_up_iterations
 from hindrl_jax.training.devices import free_memory, seed_mesh
 
@@ -180,6 +181,8 @@ def _numbers_in_memory(env: Environment, config: TrainConfig, num_demos: int) ->
     inputs, widths = 2 * dim + action_dim, [width * (RESIDUAL_EXPANSION if agent.residual else 1) for width in agent.net_arch]
     weights = sum(before * after for before, after in zip([inputs, *widths], [*widths, agent.critic_outputs], strict=True))
     demonstrations = num_demos * steps * (env.observation_dim + action_dim + state_dim(env))
+    if config.imitation_steps > 0:  # of practice the best, the newest, and both tables in one
+        demonstrations += 3 * NUM_STARTS * steps * (env.observation_dim + action_dim)
     networks = weights * (6 + 4 * agent.num_critics)  # parameters, targets and averages, moments, and those that are kept
     if config.imitation_steps > 0:  # parameters, moments, the average, three clones and those that are kept
         first, second = IMITATION_NET_ARCH

@@ -17,6 +17,7 @@ from hindrl_jax.base.types import Episodes
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.core.agent import Params, Policy, policy
 from hindrl_jax.core.holding import hold, hold_demonstrations, in_control_steps, with_action_hold
+from hindrl_jax.core.imitation import Attempts
 from hindrl_jax.core.rollout import Evaluation
 from hindrl_jax.training.checks import check_config, check_memory, check_seeds, check_trainable, configs_per_seed, demonstrations_per_seed
 from hindrl_jax.training.devices import gather, spread
@@ -25,12 +26,11 @@ from hindrl_jax.training.judging import as_judged_by, steps_to_goal
 from hindrl_jax.training.programs import FRESH_EPISODES, JaxPrograms, Programs
 from hindrl_jax.training.progress import ProgressBar
 from hindrl_jax.training.result import SAMPLED_SUCCESS, Result, Row
-from hindrl_jax.training.selection import Trial, better, choose, keep, nothing_kept
+from hindrl_jax.training.selection import Moment, Trial, better, choose, keep, nothing_kept
 
 Report = Callable[[Result], Any]
 RISING = 1.02
-"""Practice goes on while the score of a round, the mean worth of its attempts, is more than so many times the best before: gamma to the number of
-decisions until the goal, 0 for an attempt that does not solve the task."""
+"""Practice goes on while the mean worth of a round's attempts is more than so many times the best before."""
 
 
 class Diverged(UserError):
@@ -59,11 +59,12 @@ def fit(
       demonstrations: one table for all seeds, or one table per seed (with equal numbers of demonstrations).
       config: for example from `preset`; one for all seeds, or one per seed. They may differ in the fields of `config.SWEEPABLE`.
       seeds: non-negative integers. A seed gives the same run whatever the others are, up to floating-point rounding. But an `action_hold` of None is
-        chosen by the demonstrations of all of them, and with `stop_at` they all learn on until the last of them is done.
-      report: called after compilation, several times between evaluations, after each evaluation, and at the end. Where it returns True
-        while the experiment learns, that ends: what was found so far is returned as usual. Where it has a method `wait`, as `ProgressBar` does,
-        that is called with "compiling" before this begins, since it takes 10 s to minutes. None shows a `ProgressBar` where a person watches, in a
-        terminal or a notebook, and nothing elsewhere; `lambda result: None` shows nothing anywhere.
+        chosen by the demonstrations of all of them, with `stop_at` they all learn on until the last of them is done, and clones practise for as long
+        as that is of use to one of them.
+      report: called after compilation, after each round of practice, several times between evaluations, after each evaluation, and at the end.
+        Where it returns True while the experiment practises or learns, that ends: what was found so far is returned as usual. Where it has a method
+        `wait`, as `ProgressBar` does, that is called with "compiling" before this begins, since it takes 10 s to minutes. None shows a `ProgressBar`
+        where a person watches, in a terminal or a notebook, and nothing elsewhere; `lambda result: None` shows nothing anywhere.
       restore: called before anything is computed with a result whose guidance, state and key are `jax.ShapeDtypeStruct`s. Where it returns
         what `report` was given at some time in an earlier call with the same arguments, the experiment goes on from there, and all that
         follows is the same, bit for bit; see `hindrl_jax.runs.checkpoints`. Where it returns None, the experiment begins. In environments that
@@ -170,36 +171,42 @@ def _imitate(result: Result, programs: Programs, report: Report, started: float)
     """
     config, practice = result.config, programs.no_practice()
     score, best = np.zeros(len(result.seeds)), None
-    for rounds in range(config.practice_rounds + 1):
+    for index in range(config.practice_rounds + 1):
         result.state, clones = programs.imitate(result.state, result.guidance, practice)
         _check_clones(result, clones[-1])
-        for clone in clones if rounds == 0 else clones[-1:]:
+        for clone in clones if index == 0 else clones[-1:]:
             policies = policy(result.state.agent.replace(imitation=clone), config, average=True, imitates=True)
             evaluation = _played(result, programs, policies, config.eval_episodes)
             best = evaluation if best is None else better(best, evaluation)[1]
-            if rounds == 0:
+            if index == 0:
                 success = result.cloned_success = np.asarray(best.success).mean(axis=1)
             else:
                 success = result.practised_success = np.asarray(evaluation.success).mean(axis=1)
-            result.train_seconds = time.perf_counter() - started
-            _keep(result, programs, policies, np.zeros(len(result.seeds)), evaluation)
+            result.train_seconds = result.imitation_seconds = time.perf_counter() - started
+            _keep(result, programs, policies, np.zeros(len(result.seeds)), evaluation, result.moment._replace(env_steps=result.practice_steps))
             if result.kept.all_confirmed:  # and so the run ends here
-                result.rows += _rows(result, best, {})
+                result.rows += _rows(result, best, {}, result.practice_steps)
                 return True
         if config.practice_rounds > 0 and _asks_to_end(report(result)):
             return True
-        if rounds == config.practice_rounds or not success.any():
+        if index == config.practice_rounds or not success[result.kept.confirmed < 0].any():
             return False
         practice, attempts = programs.practise(result.state, result.guidance, practice)
-        attempts = jax.device_get(gather(attempts))
-        steps = jax.device_get(in_control_steps(attempts, result.env, config.num_held).length)
-        result.practice_steps = result.practice_steps + steps.sum(axis=(1, 2), dtype=np.int64)
-        gammas = np.asarray([of_run.batch.gamma for of_run in result.configs])[:, None, None]
-        worth = np.where(attempts.solved, gammas**attempts.delay, 0.0).mean(axis=(1, 2))
-        if not (worth > RISING * score).any():
+        attempts, is_open = gather(attempts), result.kept.confirmed < 0
+        steps = np.asarray(in_control_steps(attempts, result.env, config.num_held).length).sum(axis=(1, 2), dtype=np.int64)
+        result.practice_steps = result.practice_steps + np.where(is_open, steps, 0)
+        result.imitation_seconds = time.perf_counter() - started
+        worth = _worth(attempts, result.configs)
+        if not (is_open & (worth > RISING * score)).any():
             return False
         score = np.maximum(score, worth)
     return False
+
+
+def _worth(attempts: Attempts, configs: Sequence[TrainConfig]) -> np.ndarray:
+    """(S,) mean over the attempts (S, K, M) of gamma to the number of decisions before the goal, 0 for those that did not solve the task."""
+    gammas = np.asarray([config.batch.gamma for config in configs])[:, None, None]
+    return np.where(attempts.solved, gammas**attempts.delay, 0.0).mean(axis=(1, 2))
 
 
 def _asks_to_end(answer: Any) -> bool:
@@ -229,7 +236,7 @@ def _evaluate(result: Result, programs: Programs, started: float) -> None:
     _keep(result, programs, present, noise, evaluation)
 
 
-def _keep(result: Result, programs: Programs, policies: Policy, noise: np.ndarray, evaluation: Evaluation) -> None:
+def _keep(result: Result, programs: Programs, policies: Policy, noise: np.ndarray, evaluation: Evaluation, moment: Moment | None = None) -> None:
     """Keeps what is good of policies that were evaluated with some noise, and confirms those with which a run may end."""
     confirmed, stop_at = np.zeros(len(result.seeds), bool), result.config.stop_at
     if stop_at is not None:
@@ -237,7 +244,7 @@ def _keep(result: Result, programs: Programs, policies: Policy, noise: np.ndarra
         if confirmed.any():
             again = _played(result, programs, _with_noise(policies, noise, programs), FRESH_EPISODES)
             confirmed &= np.asarray(again.success).mean(axis=1) >= stop_at
-    result.kept = keep(result.kept, Trial(gather(policies.actor), noise, evaluation), confirmed, result.moment)
+    result.kept = keep(result.kept, Trial(gather(policies.actor), noise, evaluation), confirmed, moment or result.moment)
 
 
 def _with_noise(policies: Policy, noise: np.ndarray, programs: Programs) -> Policy:
@@ -279,11 +286,12 @@ def _check_finite(result: Result) -> None:
             )
 
 
-def _rows(result: Result, evaluation: Evaluation, metrics: dict[str, np.ndarray]) -> list[Row]:
+def _rows(result: Result, evaluation: Evaluation, metrics: dict[str, np.ndarray], env_steps: np.ndarray | None = None) -> list[Row]:
+    """Of an evaluation; the environment steps are the experiment's, unless they are given, (S,)."""
     return [
         Row(
             seed=seed,
-            env_steps=result.env_steps,
+            env_steps=result.env_steps if env_steps is None else int(env_steps[index]),
             updates=result.updates,
             seconds=result.train_seconds,
             success=float(evaluation.success[index].mean()),

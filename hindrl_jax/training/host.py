@@ -116,17 +116,21 @@ class HostPrograms(Programs):
         """As `core.imitation.practise`, a few starts after the other: as many as there are environments for each run."""
         num_envs = self._shape[1]
         stepper = with_goals_of(self._fresh, self.env, guidance.behavioural_goals)
-        imitating, key = policy(state.agent, self.config, average=True, imitates=True), _practice_keys(state.key, practice.rounds)
-        batches = []
+        imitating, key = policy(state.agent, self.config, average=True, imitates=True), _practice_keys(state.key, practice.num_rounds)
+        batches: list[list[Episodes]] = []
         for _ in range(-(-NUM_STARTS // num_envs)):
             key, key_seeds, key_act = jnp.moveaxis(jax.vmap(functools.partial(jax.random.split, num=3))(key), 1, 0)
-            seeds = np.asarray(jax.vmap(lambda key: jax.random.bits(key, (num_envs,)))(key_seeds)).reshape(-1)
-            rng = np.random.default_rng(seeds)
+            seeds = np.asarray(jax.vmap(lambda key: jax.random.bits(key, (num_envs,)))(key_seeds))
             act = self._policies.acting(key_act, imitating)
-            batches.append([self._by_seed(record(stepper, self.env, seeds, with_noise(act, self.env, noise, rng))) for noise in NOISES])
-        best, of_each = jax.tree.map(np.zeros_like, self.no_practice()).replace(rounds=np.asarray(practice.rounds) + 1), []
-        for attempt in zip(*batches, strict=True):
-            episodes = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1)[:, :NUM_STARTS], *attempt)
+            of_batch: list[Episodes] = []
+            for attempt, noise in enumerate(NOISES, start=1):  # which makes these numbers other ones than those of goals
+                generators = [np.random.default_rng([attempt, *of_run]) for of_run in seeds]
+                of_batch.append(self._by_seed(record(stepper, self.env, seeds.reshape(-1), with_noise(act, self.env, noise, generators))))
+            batches.append(of_batch)
+        best, of_each = jax.device_get(self.no_practice()).replace(num_rounds=np.asarray(practice.num_rounds) + 1), []
+        for index in range(len(NOISES)):
+            of_attempt = [batch[index] for batch in batches]
+            episodes = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1)[:, :NUM_STARTS], *of_attempt)
             best, attempts = jax.vmap(with_attempt)(best, episodes)
             of_each.append(attempts)
         return self._put(best), jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *of_each)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -125,13 +125,15 @@ def play(stepper: Stepper, seeds: np.ndarray, act: HostAct, num_episodes: int) -
     return success, length
 
 
-def with_noise(act: HostAct, env: Environment, noise: float, rng: np.random.Generator) -> HostAct:
-    """The policy with Gaussian noise on its actions, whose deviation counts in the range [-1, 1]."""
+def with_noise(act: HostAct, env: Environment, noise: float, generators: Sequence[np.random.Generator]) -> HostAct:
+    """The policies of S runs with Gaussian noise on their actions, whose deviation counts in the range [-1, 1]; each run has its own generator."""
     deviation = noise * (np.asarray(env.action_high) - np.asarray(env.action_low)) / 2.0
 
     def noisy(observation: np.ndarray, desired_goal: np.ndarray) -> np.ndarray:
         action = act(observation, desired_goal)
-        return np.clip(action + deviation * rng.standard_normal(action.shape), env.action_low, env.action_high).astype(np.float32)
+        of_run = (len(action) // len(generators), action.shape[1])
+        drawn = np.concatenate([generator.standard_normal(of_run) for generator in generators])
+        return np.clip(action + deviation * drawn, env.action_low, env.action_high).astype(np.float32)
 
     return noisy
 

@@ -96,7 +96,8 @@ class Programs(abc.ABC):
 
     def no_practice(self) -> Practice:
         """Before the first round."""
-        return spread(jax.tree.map(lambda shape: np.zeros(shape.shape, shape.dtype), self._practice), self.mesh)
+        of_one_run = jax.device_get(imitation.no_practice(self.env))
+        return spread(jax.tree.map(lambda leaf, shape: np.broadcast_to(leaf, shape.shape), of_one_run, self._practice), self.mesh)
 
     @abc.abstractmethod
     def learn(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, Metrics]:

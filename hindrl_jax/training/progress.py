@@ -65,7 +65,7 @@ class ProgressBar:
                 self._lines_said = tenths
                 self.say(evaluation_line(result.rows[-len(result.seeds) :]))
         if result.final_success is None:
-            if self._began is None and result.train_seconds:
+            if self._began is None and result.steps_done and result.train_seconds:
                 self._began = (result.steps_done, result.train_seconds)
             self._draw(bar(result, self._began, width=self._console.width - 1, unicode="utf" in self._console.encoding.lower()))
         else:

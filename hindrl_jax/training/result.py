@@ -55,7 +55,7 @@ class SeedSummary:
     returned_noise: float
     """Of its actions: 0 where it plays the mean ones, 1 where it samples them, whichever was seen to solve more."""
     returned_env_steps: int
-    """Environment steps after which the returned policy was seen."""
+    """Environment steps after which the returned policy was seen; of a clone, those of its practice."""
     returned_updates: int
     returned_seconds: float
     final_success: float
@@ -68,9 +68,10 @@ class SeedSummary:
     """Mean length of the 100 fresh episodes of the last policy."""
     cloned_success: float | None
     """Share of an evaluation's episodes that the policy cloned at the start solves (`TrainConfig.imitation_steps`), the most of three; None where
-    there is none. Where that one is returned, `returned_env_steps` is 0."""
+    there is none. Where that one is returned, `returned_updates` is 0."""
     practised_success: float | None
-    """The same after the last round of practice (`TrainConfig.practice_rounds`); None where there was none."""
+    """The share that it solves in an evaluation after the last round of practice (`TrainConfig.practice_rounds`); None where there was none. The
+    clone of an earlier round may be better, and the one that is returned."""
     practice_steps: int
     """Environment steps of that practice; `env_steps` does not count them."""
     evaluation_steps: int
@@ -97,6 +98,8 @@ class Result:
     compile_seconds: float
     train_seconds: float = 0.0
     """Wall-clock time so far, evaluations included, compilation not."""
+    imitation_seconds: float = 0.0
+    """Those of them before learning began: cloning, practice and their evaluations."""
     env_steps: int = 0
     """Environment steps of each run so far."""
     updates: int = 0
@@ -106,7 +109,7 @@ class Result:
     cloned_success: np.ndarray | None = None
     """(S,) share of an evaluation's episodes that the policies cloned at the start solve, the most of three; None where there are none."""
     practised_success: np.ndarray | None = None
-    """(S,) the same after the latest round of practice; None where there was none."""
+    """(S,) the share that they solve in an evaluation after the latest round of practice; None where there was none."""
     practice_steps: np.ndarray | None = None
     """(S,) int, environment steps of that practice, which `env_steps` does not count; zeros where none are given."""
     returned: Returned | None = None

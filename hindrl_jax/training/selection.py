@@ -30,7 +30,8 @@ Play = Callable[[Any, np.ndarray], Evaluation]
 class Moment(NamedTuple):
     """How far an experiment is."""
 
-    env_steps: int
+    env_steps: int | np.ndarray
+    """Of all runs, or (S,) of each."""
     updates: int
     seconds: float
 
@@ -159,8 +160,9 @@ def choose(kept: Kept, last: Any, now: Moment, play: Play) -> tuple[Returned, Ev
                 scores[:, index] = np.where(there, _score(candidates[index], noises[index], play), -np.inf)
         chosen = np.where(kept.confirmed >= 0, kept.confirmed, np.argmax(scores, axis=1))
 
-    def of_chosen(values: np.ndarray, value_now: float) -> np.ndarray:
-        return np.concatenate([values, np.full((len(values), 1), value_now, values.dtype)], axis=1)[runs, chosen]
+    def of_chosen(values: np.ndarray, value_now: float | np.ndarray) -> np.ndarray:
+        now_of_each = np.broadcast_to(value_now, len(values)).astype(values.dtype)
+        return np.concatenate([values, now_of_each[:, None]], axis=1)[runs, chosen]
 
     actor = jax.tree.map(lambda *leaves: np.stack(leaves, axis=1)[runs, chosen], *candidates)
     noise = np.stack(noises, axis=1)[runs, chosen]

@@ -25,6 +25,7 @@ from hindrl_jax.tasks.presets import preset
 from hindrl_jax.training.result import Row
 
 SEED_FIELDS = {"seed", "final_success", "env_steps_to_95", "updates_to_95", "seconds_to_95", "episode_length", "evaluation_steps", "cloned_success"}
+SEED_FIELDS |= {"practised_success", "practice_steps"}
 SEED_FIELDS |= {f"returned_{what}" for what in ("success", "length", "noise", "env_steps", "updates", "seconds")}
 TOTALS = {"updates_per_second", "env_steps_per_second", "compile_seconds", "train_seconds", "peak_memory_bytes"}
 
@@ -107,10 +108,12 @@ def evaluation(seed, env_steps, mean, sampled):
 
 
 def test_a_clone_that_was_kept_is_called_one():
-    learnt, clone = ({"seed": seed, "returned_updates": updates} for seed, updates in ((3, 500), (4, 0)))
+    learnt, clone = ({"seed": seed, "returned_updates": updates, "returned_env_steps": 8 * updates} for seed, updates in ((3, 500), (4, 0)))
     assert said_of_clones([learnt]) == []
     assert said_of_clones([clone]) == ["what was kept at step 0 is the clone of the demonstrations"]
     assert said_of_clones([learnt, clone]) == ["what was kept at step 0 of seed 4 is the clone of the demonstrations"]
+    practised = said_of_clones([learnt, clone | {"returned_env_steps": 900}])
+    assert practised == ["what was kept of seed 4 is the clone of the demonstrations, and its steps are those of its practice"]
     assert "of seeds 4, 5 is" in said_of_clones([learnt, clone, clone | {"seed": 5}])[0]
 
 

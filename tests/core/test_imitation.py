@@ -194,7 +194,7 @@ def test_practice_plays_each_start_several_times_and_its_episodes_are_what_the_e
     state = state.replace(agent=state.agent.replace(imitation=playing(state.agent.imitation, 0.0)))  # 5 steps of 1, for more than 4
     practise = jax.jit(functools.partial(imitation.practise, env=env, config=config))
     practice, attempts = practise(state, data, imitation.no_practice(env))
-    assert int(practice.rounds) == 1
+    assert int(practice.num_rounds) == 1
     assert attempts.solved.shape == attempts.length.shape == attempts.delay.shape == (len(imitation.NOISES), imitation.NUM_STARTS)
     np.testing.assert_array_equal(practice.solved, attempts.solved.any(axis=0))
     assert attempts.solved[0].all()
@@ -211,5 +211,5 @@ def test_practice_plays_each_start_several_times_and_its_episodes_are_what_the_e
             np.testing.assert_allclose(time_step.observation, episodes.observations[row, step + 1], atol=1e-5)
             assert float(time_step.reward) == episodes.rewards[row, step]
     again, _ = practise(state, data, practice)
-    assert int(again.rounds) == 2
+    assert int(again.num_rounds) == 2
     assert not np.array_equal(again.episodes.observations[:, 0], episodes.observations[:, 0])  # other starts

@@ -76,9 +76,9 @@ def towards_goal(observation, goal):
 
 def test_recorded_episodes_are_what_the_environment_makes_of_their_actions(env):
     """Noisy ones, with equal seeds from equal starts."""
-    stepper, rng, seeds = env.stepper(3), np.random.default_rng(0), np.arange(3, dtype=np.uint32)
+    stepper, generators, seeds = env.stepper(3), [np.random.default_rng(0)], np.arange(3, dtype=np.uint32)
     try:
-        first, second = (record(stepper, env, seeds, with_noise(towards_goal, env, noise, rng)) for noise in (0.0, 0.3))
+        first, second = (record(stepper, env, seeds, with_noise(towards_goal, env, noise, generators)) for noise in (0.0, 0.3))
     finally:
         stepper.close()
     np.testing.assert_array_equal(first.observations[:, 0], second.observations[:, 0])

@@ -11,10 +11,10 @@ import tiny
 from toy_env import Corridor, corridor_demonstrations
 
 import hindrl_jax as hindrl
-from hindrl_jax.core.imitation import NOISES, NUM_STARTS
+from hindrl_jax.core.imitation import NOISES, NUM_STARTS, Attempts
 from hindrl_jax.core.rollout import Evaluation
 from hindrl_jax.runs.checkpoints import Checkpoints
-from hindrl_jax.training.experiment import Diverged
+from hindrl_jax.training.experiment import Diverged, _worth
 from hindrl_jax.training.selection import CHOICE_ROUNDS, NUM_KEPT, Moment, Trial, better, choose, keep, nothing_kept
 
 NOBODY = np.zeros(1, bool)
@@ -293,9 +293,34 @@ def test_practice_makes_a_clone_faster_than_its_demonstrations():
     rounds = [steps for done, _, steps in said if not done]
     assert all((later >= sooner).all() for sooner, later in itertools.pairwise(rounds))
     assert [summary.practice_steps for summary in result.summaries()] == result.practice_steps.tolist()
+    kept_at = np.where(result.kept.actor["imitates"] == 1, result.kept.env_steps, 0)  # the steps of its practice until then
+    assert (kept_at.max(axis=1) > 0).all()
+    assert (kept_at.max(axis=1) <= result.practice_steps).all()
     # Learning goes on as it would have without.
     for found, expected in zip(jax.tree.leaves(result.state.agent.actor), jax.tree.leaves(before.state.agent.actor), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5)
+
+
+def test_the_steps_of_practice_are_those_after_which_a_run_was_solved():
+    """The demonstrations are just fast enough, and their clones not quite, until they have practised."""
+    walking = corridor_demonstrations((0.601, 0.601))
+    walking = walking.replace(observations=walking.observations.at[:, :, 0].set(jnp.array([[0.2], [0.8]])))
+    result = fit(dataclasses.replace(CLONING, practice_rounds=8), walking)
+    assert (result.cloned_success < 0.9).any()
+    assert result.kept.all_confirmed
+    assert result.env_steps == 0
+    assert result.practice_steps.max() > 0
+    at = result.kept.env_steps[np.arange(2), result.kept.confirmed]
+    assert result.returned.env_steps.tolist() == at.tolist()
+    assert at.max() == result.practice_steps.max()
+    assert (result.practice_steps == at).all()  # a run that is over practises no more
+    assert [row.env_steps for row in result.rows] == result.practice_steps.tolist()
+
+
+def test_what_attempts_are_worth():
+    attempts = Attempts(solved=np.array([[[True, False], [True, True]]]), length=np.full((1, 2, 2), 5), delay=np.array([[[0, 3], [1, 2]]]))
+    configs = [dataclasses.replace(CONFIG, batch=dataclasses.replace(CONFIG.batch, gamma=0.5))]
+    np.testing.assert_allclose(_worth(attempts, configs), [(1.0 + 0.0 + 0.5 + 0.25) / 4])
 
 
 def test_practice_ends_where_it_is_of_no_use_and_where_a_report_says_so():
