@@ -58,7 +58,6 @@ OF_THE_HOST = {
     "eval_every": "how many iterations are run between evaluations",
     "eval_episodes": "how many episodes an evaluation plays; it does not lead back to the policy",
     "stop_at": "ends the run",
-    "practice_rounds": "the loop over rounds is Python's",
     "action_chunks": "as action_hold",
     "action_hold": "the programs are given another environment and other demonstrations, and count steps by it",
 }
@@ -71,6 +70,7 @@ VALUES = {
     "demo_reset_ratio": (0.5, 0.25),
     "demo_reset_curriculum": (True, False),
     "imitation_steps": (3, 6),
+    "practice_rounds": (1, 0),
     "imitation_proposal": (True, False),
     "buffer_size": (60, 40),
     "batch_size": (16, 8),

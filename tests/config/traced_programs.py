@@ -43,7 +43,12 @@ class Stages:
         return train.collect(state, data, **self.given(values), num_iterations=train.warm_up_iterations(ENV, self.config)), data
 
     def imitate(self, values, state, data):
-        return imitation.imitate(state, data, imitation.no_practice(ENV), **self.given(values))[0], data
+        practice = imitation.no_practice(ENV)
+        for index in range(self.config.practice_rounds + 1):
+            state, _ = imitation.imitate(state, data, practice, **self.given(values))
+            if index < self.config.practice_rounds:
+                practice, _ = imitation.practise(state, data, practice, **self.given(values))
+        return state, data
 
     def clone(self, values, state, data):
         return agent.policy(train.clone(state, data, **self.given(values), num_iterations=2)[0].agent, self.config, average=True)
