@@ -167,6 +167,7 @@ def test_a_fault_in_training_is_one_line_and_the_last_checkpoint_stands(tmp_path
     monkeypatch.setattr("hindrl_jax.tasks.from_gymnasium.GymnasiumEnv.interchangeable", ("vectorization", "make_kwargs"))
     out = tmp_path / "run"
     arguments = ["--make-kwargs", "fault=raise", "episode=12", "--demos", odd_demonstrations, "--out", out, "--checkpoint-every", "0.05"]
+    arguments += ["--practice-rounds", "0"]  # the twelfth episode is to be one of learning
     line = refusal(capsys, "train", "--env", ODD, *arguments, *TINY)
     assert re.search(
         "failed at step 3( to [0-9]+)? of an episode: it raised RuntimeError: the arm fell off; the last good checkpoint, of step ", line
