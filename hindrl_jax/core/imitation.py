@@ -25,7 +25,7 @@ from hindrl_jax.core.guidance import Guidance
 from hindrl_jax.core.inputs import network_inputs
 from hindrl_jax.core.networks import apply_actor
 from hindrl_jax.core.randomness import uniform_index
-from hindrl_jax.core.replay import sample_steps
+from hindrl_jax.core.replay import empty_table, sample_steps
 from hindrl_jax.core.rollout import Act
 from hindrl_jax.core.train import TrainState, clone_from
 
@@ -56,14 +56,8 @@ class Attempts(struct.PyTreeNode, kw_only=True):
 
 def no_practice(env: Environment) -> Practice:
     """Before the first round."""
-    episodes = Episodes(
-        observations=jnp.zeros((NUM_STARTS, env.horizon + 1, env.observation_dim)),
-        actions=jnp.zeros((NUM_STARTS, env.horizon, env.action_dim)),
-        rewards=jnp.zeros((NUM_STARTS, env.horizon)),
-        lengths=jnp.ones(NUM_STARTS, jnp.int32),
-        terminated=jnp.zeros(NUM_STARTS, bool),
-        desired_goals=jnp.zeros((NUM_STARTS, env.goal_dim)),
-    )
+    episodes = empty_table(env, NUM_STARTS)
+    episodes = episodes.replace(lengths=jnp.ones_like(episodes.lengths))  # steps can be drawn from them, and are not used
     return Practice(episodes=episodes, solved=jnp.zeros(NUM_STARTS, bool), num_rounds=jnp.zeros((), jnp.int32))
 
 

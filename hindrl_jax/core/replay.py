@@ -63,18 +63,23 @@ def init(env: Environment, *, num_envs: int, capacity: int, notes: Mapping[str, 
         )
     rows = num_envs * slots
     return ReplayState(
-        episodes=Episodes(
-            observations=jnp.zeros((rows, env.horizon + 1, env.observation_dim)),
-            actions=jnp.zeros((rows, env.horizon, env.action_dim)),
-            rewards=jnp.zeros((rows, env.horizon)),
-            lengths=jnp.zeros(rows, jnp.int32),
-            terminated=jnp.zeros(rows, bool),
-            desired_goals=jnp.zeros((rows, env.goal_dim)),
-        ),
+        episodes=empty_table(env, rows),
         slot=jnp.zeros(num_envs, jnp.int32),
         step=jnp.zeros(num_envs, jnp.int32),
         num_complete=jnp.zeros(num_envs, jnp.int32),
         notes={name: jnp.full((rows, env.horizon), value) for name, value in (notes or {}).items()},
+    )
+
+
+def empty_table(env: Environment, num_episodes: int) -> Episodes:
+    """A table with room for so many episodes, none of which has been played: of length 0."""
+    return Episodes(
+        observations=jnp.zeros((num_episodes, env.horizon + 1, env.observation_dim)),
+        actions=jnp.zeros((num_episodes, env.horizon, env.action_dim)),
+        rewards=jnp.zeros((num_episodes, env.horizon)),
+        lengths=jnp.zeros(num_episodes, jnp.int32),
+        terminated=jnp.zeros(num_episodes, bool),
+        desired_goals=jnp.zeros((num_episodes, env.goal_dim)),
     )
 
 
