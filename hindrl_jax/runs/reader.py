@@ -16,7 +16,7 @@ import numpy as np
 from flax.traverse_util import unflatten_dict
 
 from hindrl_jax.base.compilation import in_float32
-from hindrl_jax.base.environments import Environment, Restorable
+from hindrl_jax.base.environments import Environment, Restorable, compiler_options
 from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.base.files import DAMAGED_ARCHIVE, check_can_write, disk_trouble, read_arrays, write_atomically
 from hindrl_jax.base.steppers import can_be_watched
@@ -228,10 +228,18 @@ def draw_episodes(path: Path, env: Environment, episodes: Sequence[np.ndarray]) 
     for states in episodes:
         if states.shape[-1] != env.state_dim:
             raise UserError(f"states of {states.shape[-1]} numbers are not those of {env.name}, which has {env.state_dim}: record them again")
-    key = jax.random.key(0)
-    unpacked = [[env.vector_to_state(key, jnp.asarray(state)) for state in states] for states in episodes]
+    unpacked = [_unpacked(env, states) for states in episodes]
     with disk_trouble(path):
         save_film(env, unpacked, path)
+
+
+def _unpacked(env: Restorable, vectors: np.ndarray) -> list[Any]:
+    """The states that vectors (T, S) give, with numpy leaves and all with the same key, in one program."""
+    key = jax.random.key(0)
+    unpack = jax.jit(jax.vmap(lambda vector: env.vector_to_state(key, vector)), compiler_options=compiler_options(env))
+    leaves, structure = jax.tree.flatten(unpack(vectors))
+    leaves = [[key] * len(vectors) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else np.asarray(leaf) for leaf in leaves]
+    return [jax.tree.unflatten(structure, [leaf[step] for leaf in leaves]) for step in range(len(vectors))]
 
 
 @in_float32

@@ -105,6 +105,27 @@ def test_viewer_may_be_an_object_or_the_name_of_a_module(forget, tmp_path):
         assert picture.size == (70, 5)
 
 
+def test_the_states_of_a_film_are_unpacked_together(forget, tmp_path, monkeypatch):
+    """One by one, each would be compiled anew in tasks that map over something: 70 s for a film of the cables."""
+    drawn, calls = [], []
+
+    class Viewer:
+        @staticmethod
+        def animation(env, states, *, captions):
+            drawn.extend(states)
+            return [np.zeros((4, 4, 3), np.uint8) for _ in states], [0.1 for _ in states]
+
+    env = make("two_rooms:TwoRooms")
+    unpack = type(env).vector_to_state
+    monkeypatch.setattr(type(env), "vector_to_state", lambda *given: calls.append(1) or unpack(*given))
+    register(type(env), viewer=Viewer)
+    vectors = np.array([[0.1 * step, 0.2, 0.3, 0.0] for step in range(6)], np.float32)
+    draw_episodes(tmp_path / "film.gif", env, [vectors])
+    assert len(calls) == 1
+    np.testing.assert_array_equal([env.state_to_vector(state) for state in drawn], vectors)
+    assert all(isinstance(leaf, np.ndarray | np.generic) for leaf in jax.tree.leaves(drawn) if not jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key))
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [
