@@ -51,6 +51,7 @@ def main() -> None:
         cable_parity,
         cable_safety,
         cable_speed,
+        compilation,
         environments,
         gradient_step,
         host_loop,
@@ -78,6 +79,7 @@ def main() -> None:
         "relabelling": relabelling,
         "replay_size": replay_size,
         "seeds": seeds,
+        "compilation": compilation,
         "startup": startup,
     }
     chosen = given.only or list(parts)

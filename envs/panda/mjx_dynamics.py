@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from hindrl_jax.base.compilation import without_fusion_emitters
 from hindrl_jax.base.types import Array
 from hindrl_jax.envs.panda import controller, robot
 from hindrl_jax.envs.panda.kinematics import posture
@@ -25,8 +26,7 @@ def compiler_options() -> dict[str, Any]:
     knows the option that turns it off."""
     if jax.default_backend() != "cpu":
         return {}
-    fusion = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11, 1) else {}
-    return {"xla_cpu_enable_concurrency_optimized_scheduler": False} | fusion
+    return {"xla_cpu_enable_concurrency_optimized_scheduler": False} | without_fusion_emitters()
 
 
 @functools.cache

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Protocol, TypeGuard, get_args, get_type_hints,
 
 import jax.numpy as jnp
 
+from hindrl_jax.base.compilation import without_fusion_emitters
 from hindrl_jax.base.types import Array, TimeStep
 
 
@@ -88,9 +89,11 @@ def holds_goal(env: Environment) -> bool:
     return getattr(env, "success", None) == "held"
 
 
-def compiler_options(env: Environment) -> dict[str, Any]:
-    """Options that XLA needs for programs that step this environment, for `jax.jit` or `compile`; most environments need none."""
-    return getattr(env, "compiler_options", {})
+def compiler_options(env: Environment, *, learns: bool = False) -> dict[str, Any]:
+    """Options of XLA for a program that steps this environment, for `jax.jit` or `compile`: those that it needs, of which most need none, and those
+    with which the program compiles sooner, unless it `learns`: is mostly gradient steps.
+    """
+    return ({} if learns else without_fusion_emitters()) | getattr(env, "compiler_options", {})
 
 
 @runtime_checkable

@@ -82,13 +82,13 @@ class HostPrograms(Programs):
             rest = (guidance, values)
             pending = {"start": compile_(starting)}
             if not config.learns_from_rollouts:
-                pending["clone"] = compile_(self._trace(training.clone, state, *rest, donate=True, num_iterations=self.chunk))
+                pending["clone"] = compile_(self._trace(training.clone, state, *rest, donate=True, num_iterations=self.chunk), learns=True)
             else:
                 planning = (state.key, policy(state.agent, config, average=False), state.rollout, values)
                 deciding = self._trace(decide, *planning, at_random=False)
                 _, plan = shapes_on(deciding.out_info, self.mesh)
                 step = shapes_on(_time_step_shapes(self._shape, env.observation_dim), self.mesh)
-                pending["improve"] = compile_(self._trace(improve, state, plan, *rest, donate=True))
+                pending["improve"] = compile_(self._trace(improve, state, plan, *rest, donate=True), learns=True)
                 pending["remember"] = compile_(self._trace(remember, state, plan, (step, begun), *rest, donate=True))
                 pending["decide"] = compile_(deciding)
                 pending["decide_at_random"] = compile_(self._trace(decide, *planning, at_random=True))

@@ -112,10 +112,16 @@ class Programs(abc.ABC):
 
     @contextlib.contextmanager
     def _compiler(self) -> Iterator[Compile]:
-        """A function compile(traced, options) that hands a program to a thread, which compiles it while the next one is being traced."""
-        own = compiler_options(self.env)
+        """A function compile(traced, learns, options) that hands a program to a thread, which compiles it while the next one is being traced.
+
+        `learns` says that it is mostly gradient steps.
+        """
         with ThreadPoolExecutor() as pool:
-            yield lambda traced, **options: pool.submit(traced.lower().compile, own | options)
+
+            def compile_(traced: Any, *, learns: bool = False, **options: Any) -> Future[Any]:
+                return pool.submit(traced.lower().compile, compiler_options(self.env, learns=learns) | options)
+
+            yield compile_
 
     def _trace(self, function: Callable[..., Any], *shapes: Any, donate: bool = False, **static: Any) -> Any:
         """A function of one run, traced for all of them. The last shapes are those of the swept values, which it finds in its config."""
@@ -168,7 +174,7 @@ class JaxPrograms(Programs):
             starting, guidance, state, key = self._trace_start(start, *given, None, values)
             actor, rest = policy(state.agent, config, average=True), (guidance, values)
             function = training.learn if config.learns_from_rollouts else training.clone
-            pending = {"learn": compile_(self._trace(function, state, *rest, donate=True, num_iterations=self.chunk))}
+            pending = {"learn": compile_(self._trace(function, state, *rest, donate=True, num_iterations=self.chunk), learns=True)}
             pending["start"] = compile_(starting, **_RUN_ONCE)
             for num_episodes in {config.eval_episodes, FRESH_EPISODES}:
                 pending[f"evaluate {num_episodes}"] = compile_(self._trace(evaluate, key, actor, *rest, num_episodes=num_episodes))

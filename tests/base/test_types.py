@@ -49,13 +49,18 @@ def test_protocols(env):
     assert not isinstance(SimpleNamespace(name="bare"), Environment)
 
 
-def test_only_mjx_on_a_cpu_needs_options_of_the_compiler(monkeypatch):
+def test_options_of_the_compiler(monkeypatch):
+    """On CPUs all but gradient steps compile without the fusion emitters, where they can be turned off, and MJX always does."""
     plain = [Corridor(), GridPickAndPlace(), FixedParameterizedReach(), FixedParameterizedReach(backend="robosuite")]
-    assert [compiler_options(env) for env in plain] == [{}] * 4
-    options = {"xla_cpu_enable_concurrency_optimized_scheduler": False}
-    monkeypatch.setattr(jax, "__version_info__", (0, 11, 1))
-    assert compiler_options(ParameterizedReach(backend="mjx")) == options
-    monkeypatch.setattr(jax, "__version_info__", (0, 11, 0))
-    assert compiler_options(ParameterizedReach(backend="mjx")) == options | {"xla_cpu_use_fusion_emitters": False}
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert compiler_options(ParameterizedReach(backend="mjx")) == {}
+    on_mjx = ParameterizedReach(backend="mjx")
+    scheduler, emitters = {"xla_cpu_enable_concurrency_optimized_scheduler": False}, {"xla_cpu_use_fusion_emitters": False}
+    for version, backend, of_plain, of_mjx in (
+        ((0, 11, 0), "cpu", emitters, scheduler | emitters),
+        ((0, 11, 1), "cpu", {}, scheduler),
+        ((0, 11, 0), "gpu", {}, {}),
+    ):
+        monkeypatch.setattr(jax, "__version_info__", version)
+        monkeypatch.setattr(jax, "default_backend", lambda backend=backend: backend)
+        assert [compiler_options(env) for env in plain] == [of_plain] * 4
+        assert [compiler_options(env, learns=True) for env in plain] == [{}] * 4
+        assert compiler_options(on_mjx) == compiler_options(on_mjx, learns=True) == of_mjx
