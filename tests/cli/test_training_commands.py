@@ -163,7 +163,7 @@ def test_actions_are_held_as_the_config_says_which_notes_what_was_chosen(tmp_pat
     hindrl.save_demonstrations(demos, demonstrations, env=env, env_args=dataclasses.asdict(env))
     where = ["--env", "Corridor", "--horizon", "150", "--width", "125", "--demos", str(demos)]
     sizes = shlex.split("--num-envs 2 --learning-starts 300 --steps 330 --eval-every 20 --eval-episodes 3 --updates-per-iteration 1")
-    more = shlex.split("--batch-size 16 --net-arch 8 --buffer-size 2000 --seed 3 --seeds 2")
+    more = shlex.split("--batch-size 16 --net-arch 8 --buffer-size 2000 --seed 3 --seeds 2 --imitation-steps 0")
     cli.main(["sweep", "--over", "learning_rate=1e-3,2e-3", "--out", str(out), *where, *sizes, *more])
     printed = " ".join(capsys.readouterr().out.split())
     assert "each action is held for 2 steps, so a demonstration of 126 steps takes 63 decisions" in printed

@@ -220,10 +220,14 @@ def test_equal_configs_have_equal_programs():
     assert not Program(SMALL).differs_from(dataclasses.replace(SMALL))
 
 
-# What matters under more conditions than that there are rollouts is tried in each base, the rest in one with rollouts and in one without.
+# What matters under more conditions than that there are rollouts is tried in several bases, the rest in one with rollouts and in one without.
+# All else is tried on demand.
 OFTEN = {name for names, _, _ in CONDITIONS[1:] for name in names.split()}
-TRIED = [pytest.param(name, VALUES.keys() if name in ("hindrl", "bc") else OFTEN, id=name) for name in BASES]
-TRIED += [pytest.param(name, VALUES.keys() - OFTEN, id=f"{name}, the rest", marks=pytest.mark.slow) for name in BASES]
+IN_ALL = ("hindrl", "bc")
+IN_OFTEN = ("tqcfd", "joint_union with sac and one critic", "future with redq, residual", "no demonstration rows, proposals of a clone", "no cloning")
+FAST = {name: VALUES.keys() for name in IN_ALL} | {name: OFTEN for name in IN_OFTEN}
+TRIED = [pytest.param(name, fields, id=name) for name, fields in FAST.items()]
+TRIED += [pytest.param(name, VALUES.keys() - FAST.get(name, set()), id=f"{name}, the rest", marks=pytest.mark.slow) for name in BASES]
 
 
 # Parts of the program in which most fields of a section show.

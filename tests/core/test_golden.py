@@ -24,15 +24,13 @@ from hindrl_jax.core.guidance import guidance
 
 FILE = Path(__file__).parent.parent / "data" / "golden.json"
 NUM_UPDATES = 20
-GRID, REACH, RANDOM_REACH = "FixedGridPickAndPlace", "FixedParameterizedReach", "ParameterizedReach"
+GRID, RANDOM_REACH = "FixedGridPickAndPlace", "ParameterizedReach"
 CASES = {  # environment, model and kind of preset
     "grid-bc": (GRID, "bc", "default"),
     "grid-tqcfd": (GRID, "tqcfd", "default"),
     "grid-hindrl": (GRID, "hindrl", "default"),
     "grid-smooth-hindrl": (GRID, "smooth-hindrl", "default"),
-    "reach-hindrl": (REACH, "hindrl", "default"),
     "random-reach": (RANDOM_REACH, "hindrl", "default"),
-    "thesis-grid-hindrl": (GRID, "hindrl", "thesis"),
     "original-grid-hindrl": (GRID, "hindrl", "original"),
 }
 

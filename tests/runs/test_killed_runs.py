@@ -23,7 +23,8 @@ pytestmark = [
 
 TRAIN = shlex.split(
     "--env FixedGridPickAndPlace --size 4 --random-box-size 1 --horizon 20 --num-envs 2 --learning-starts 40 --eval-episodes 4 --seeds 2 "
-    "--updates-per-iteration 1 --batch-size 8 --net-arch 4 --num-quantiles 3 --top-quantiles-to-drop-per-net 1 --buffer-size 2000"
+    "--updates-per-iteration 1 --batch-size 8 --net-arch 4 --num-quantiles 3 --top-quantiles-to-drop-per-net 1 --buffer-size 2000 "
+    "--imitation-steps 0"
 )
 
 

@@ -86,7 +86,7 @@ def test_cloning_takes_as_many_updates_as_asked_and_no_environment_step(demonstr
 
 
 def test_the_reach_recipe_runs_from_demonstration_to_evaluation(tmp_path, monkeypatch):
-    """With every option of the recipe, in a task so coarse and networks so small that it takes seconds. For the fixed task: core/test_golden.py."""
+    """With the options of the recipe but for a clone, in a task so coarse and networks so small that it takes seconds."""
     env = hindrl.make("ParameterizedReach", num_waypoints=1, position_tolerance=0.1, rotation_tolerance=0.3, horizon=100)
     recipe = hindrl.preset("hindrl", env=env)
     config = dataclasses.replace(
@@ -98,6 +98,8 @@ def test_the_reach_recipe_runs_from_demonstration_to_evaluation(tmp_path, monkey
         demo_reset_ratio=0.5,
         eval_every=16,
         eval_episodes=2,
+        imitation_steps=0,
+        practice_rounds=0,
         batch=dataclasses.replace(recipe.batch, batch_size=32),
         agent=dataclasses.replace(recipe.agent, net_arch=(8,)),
     )
