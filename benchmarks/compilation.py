@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from typing import Any
 
 import jax
@@ -18,7 +20,7 @@ from hindrl_jax.base.compilation import without_fusion_emitters
 from hindrl_jax.base.environments import holds_goal
 from hindrl_jax.core.agent import policy
 from hindrl_jax.core.holding import hold, hold_demonstrations, with_action_hold
-from hindrl_jax.training.programs import FRESH_EPISODES, JaxPrograms
+from hindrl_jax.training.programs import FRESH_EPISODES, Compile, JaxPrograms
 
 TITLE = "Compilation"
 TASKS = ("FixedGridPickAndPlace", "FixedParameterizedReach", "BringNear")
@@ -73,28 +75,38 @@ def measure(name: str, *, emitters: bool) -> list[Row]:
             "run_s": timing.rounded(statistics.median(runs[program])),
             "updates": programs.chunk * programs.config.num_updates if program == "learn" else None,
         }
-        for program, seconds in programs.seconds.items()
+        for program, seconds in zip(programs._programs, programs.seconds, strict=True)
     ]
 
 
 class Timed(JaxPrograms):
-    """Programs that are compiled one after the other, whether an earlier run has compiled them or not, and how long that took each."""
+    """Programs that are compiled one after the other, and how long that took each, in the order in which they are kept."""
 
     def __init__(self, *given: Any, emitters: bool):
-        self.options, self.seconds = {} if emitters else without_fusion_emitters(), dict[str, float]()
-        self._compiled: dict[str, Any] = {}
+        self.options, self.seconds = {} if emitters else without_fusion_emitters(), list[float]()
         super().__init__(*given)
 
-    def _submit(self, name: str, traced: Any, *, learns: bool = False, **options: Any) -> None:
-        lowered, kept = traced.lower(), jax.config.jax_enable_compilation_cache
-        jax.config.update("jax_enable_compilation_cache", False)
-        began = time.process_time()
-        self._compiled[name] = lowered.compile(self.options | options)
-        self.seconds[name] = time.process_time() - began
-        jax.config.update("jax_enable_compilation_cache", kept)
+    @contextlib.contextmanager
+    def _compiler(self) -> Iterator[Compile]:
+        def compile_(traced: Any, *, learns: bool = False, **options: Any) -> Future[Any]:
+            lowered, began, program = traced.lower(), time.process_time(), Future[Any]()
+            program.set_result(lowered.compile(self.options | options))
+            self.seconds.append(time.process_time() - began)
+            return program
 
-    def _program(self, name: str) -> Any:
-        return self._compiled[name]
+        with without_kept_programs():
+            yield compile_
+
+
+@contextlib.contextmanager
+def without_kept_programs() -> Iterator[None]:
+    """Compiles what an earlier run has already compiled."""
+    before = jax.config.jax_enable_compilation_cache
+    jax.config.update("jax_enable_compilation_cache", False)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_enable_compilation_cache", before)
 
 
 def tables(rows: list[Row]) -> str:

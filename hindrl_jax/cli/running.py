@@ -126,7 +126,7 @@ def run(
             writer.start()
             if checkpoints is not None:
                 checkpoints.save_demonstrations(demonstrations)
-            progress.say(f"begins after {result.compile_seconds:.1f} s of compilation{_on_devices(result)}")
+            progress.say(f"compiled in {result.compile_seconds:.1f} s{_on_devices(result)}")
             num_held = result.config.num_held
             if num_held > 1:
                 steps = int(np.median([table.lengths for table in demonstrations]))

@@ -110,10 +110,9 @@ def fit(
             result.guidance, result.state, result.key = jax.block_until_ready(programs.start(seeds_on_devices, tables))
         else:
             result = restored
-        result.compile_seconds, programs.seconds_waited = time.perf_counter() - started, 0.0
+        result.compile_seconds = time.perf_counter() - started
         report(result)
         _train(result, programs, report)
-        result.compile_seconds += programs.seconds_waited
     report(result)
     return result
 
@@ -140,8 +139,8 @@ def programs_of(env: Environment, configs: Sequence[TrainConfig], demonstrations
 def _train(result: Result, programs: Programs, report: Report) -> None:
     """Takes the experiment from where it is to its end, all but the last report."""
     config, begins = result.config, result.steps_done == 0
-    clock = _clock(programs, result.train_seconds)
-    ends = _imitate(result, programs, report, clock) if begins and config.imitation_steps > 0 else result.kept.all_confirmed
+    started = time.perf_counter() - result.train_seconds
+    ends = _imitate(result, programs, report, started) if begins and config.imitation_steps > 0 else result.kept.all_confirmed
     if begins and config.learns_from_rollouts and not ends:
         result.state = jax.block_until_ready(programs.collect(result.state, result.guidance))
         result.env_steps = programs.steps_at_random
@@ -156,21 +155,15 @@ def _train(result: Result, programs: Programs, report: Report) -> None:
         _check_finite(result)
         evaluations_done = len(result.rows) // len(result.seeds)
         if result.steps_done >= min(programs.steps_at_random + (evaluations_done + 1) * config.eval_every, config.num_steps):
-            _evaluate(result, programs, clock)
-        result.train_seconds = clock()
+            _evaluate(result, programs, started)
+        result.train_seconds = time.perf_counter() - started
         ends = _asks_to_end(report(result)) or result.kept.all_confirmed
     if not result.rows:  # ended by `report` before the first evaluation
-        _evaluate(result, programs, clock)
+        _evaluate(result, programs, started)
     _finish(result, programs)
 
 
-def _clock(programs: Programs, seconds: float) -> Callable[[], float]:
-    """Seconds of training, which go on from so many; where a program is waited for, they stand still."""
-    started = time.perf_counter() - seconds
-    return lambda: time.perf_counter() - started - programs.seconds_waited
-
-
-def _imitate(result: Result, programs: Programs, report: Report, clock: Callable[[], float]) -> bool:
+def _imitate(result: Result, programs: Programs, report: Report, started: float) -> bool:
     """Clones the demonstrations, then practises for as long as that is of use. What comes of it are the first policies that are kept.
 
     Returns:
@@ -189,7 +182,7 @@ def _imitate(result: Result, programs: Programs, report: Report, clock: Callable
                 success = result.cloned_success = np.asarray(best.success).mean(axis=1)
             else:
                 success = result.practised_success = np.asarray(evaluation.success).mean(axis=1)
-            result.train_seconds = result.imitation_seconds = clock()
+            result.train_seconds = result.imitation_seconds = time.perf_counter() - started
             _keep(result, programs, policies, np.zeros(len(result.seeds)), evaluation, result.moment._replace(env_steps=result.practice_steps))
             if result.kept.all_confirmed:  # and so the run ends here
                 result.rows += _rows(result, best, {}, result.practice_steps)
@@ -202,7 +195,7 @@ def _imitate(result: Result, programs: Programs, report: Report, clock: Callable
         attempts, is_open = gather(attempts), result.kept.confirmed < 0
         steps = np.asarray(in_control_steps(attempts, result.env, config.num_held).length).sum(axis=(1, 2), dtype=np.int64)
         result.practice_steps = result.practice_steps + np.where(is_open, steps, 0)
-        result.imitation_seconds = clock()
+        result.imitation_seconds = time.perf_counter() - started
         worth = _worth(attempts, result.configs)
         if not (is_open & (worth > RISING * score)).any():
             return False
@@ -227,7 +220,7 @@ def _check_clones(result: Result, clones: Params) -> None:
         raise Diverged(f"the clone of the demonstrations of seed {result.seeds[int(np.argmin(finite))]} is not finite: try a lower learning_rate")
 
 
-def _evaluate(result: Result, programs: Programs, clock: Callable[[], float]) -> None:
+def _evaluate(result: Result, programs: Programs, started: float) -> None:
     """Evaluates the present policies, notes it, and keeps those that are good."""
     present, num_episodes = policy(result.state.agent, result.config, average=True), result.config.eval_episodes
     noise: Any = np.zeros(len(result.seeds))
@@ -237,7 +230,7 @@ def _evaluate(result: Result, programs: Programs, clock: Callable[[], float]) ->
         sampled = _played(result, programs, _with_noise(present, np.ones_like(noise), programs), num_episodes)
         averaged[SAMPLED_SUCCESS] = np.asarray(sampled.success).mean(axis=1)
         noise, evaluation = better(by_mean, sampled)
-    result.train_seconds = clock()
+    result.train_seconds = time.perf_counter() - started
     result.rows += _rows(result, by_mean, averaged)
     result.chunks.clear()
     _keep(result, programs, present, noise, evaluation)

@@ -70,7 +70,6 @@ class HostPrograms(Programs):
         self._begun = False  # whether the state's episodes are those of `stepper`
 
     def close(self) -> None:
-        super().close()
         for stepper in (self._fresh, self.stepper):
             if stepper is not None:
                 stepper.close()
@@ -78,31 +77,31 @@ class HostPrograms(Programs):
     def _compile(self, given: tuple[Any, Any], values: Any) -> None:
         env, config = self.env, self.config
         begun = shapes_on(self._nowhere(), self.mesh)
-        starting, guidance, state, _ = self._trace_start(begin, *given, begun, values)
-        rest = (guidance, values)
-        self._submit("start", starting)
-        if config.imitation_steps > 0:
-            self._submit_imitation(state, *rest)
-        if not config.learns_from_rollouts:
-            self._submit("clone", self._trace(training.clone, state, *rest, donate=True, num_iterations=self.chunk), learns=True)
-        else:
-            planning = (state.key, policy(state.agent, config, average=False), state.rollout, values)
-            deciding = self._trace(decide, *planning, at_random=False)
-            _, plan = shapes_on(deciding.out_info, self.mesh)
-            step = shapes_on(_time_step_shapes(self._shape, env.observation_dim), self.mesh)
-            self._submit("improve", self._trace(improve, state, plan, *rest, donate=True), learns=True)
-            self._submit("remember", self._trace(remember, state, plan, (step, begun), *rest, donate=True))
-            self._submit("decide", deciding)
-            self._submit("decide_at_random", self._trace(decide, *planning, at_random=True))
-        for name in self._pending:  # environments begin in processes of their own, beside which no thread is to be at work
-            self._program(name)
+        with self._compiler() as compile_:
+            starting, guidance, state, _ = self._trace_start(begin, *given, begun, values)
+            rest = (guidance, values)
+            pending = {"start": compile_(starting)}
+            if not config.learns_from_rollouts:
+                pending["clone"] = compile_(self._trace(training.clone, state, *rest, donate=True, num_iterations=self.chunk), learns=True)
+            else:
+                planning = (state.key, policy(state.agent, config, average=False), state.rollout, values)
+                deciding = self._trace(decide, *planning, at_random=False)
+                _, plan = shapes_on(deciding.out_info, self.mesh)
+                step = shapes_on(_time_step_shapes(self._shape, env.observation_dim), self.mesh)
+                pending["improve"] = compile_(self._trace(improve, state, plan, *rest, donate=True), learns=True)
+                pending["remember"] = compile_(self._trace(remember, state, plan, (step, begun), *rest, donate=True))
+                pending["decide"] = compile_(deciding)
+                pending["decide_at_random"] = compile_(self._trace(decide, *planning, at_random=True))
+            if config.imitation_steps > 0:
+                pending |= {name: compile_(program) for name, program in self._trace_imitation(state, *rest).items()}
+            self._programs = {name: program.result() for name, program in pending.items()}
 
     def start(self, seeds: Array, demonstrations: Episodes) -> tuple[Guidance, TrainState, Array]:
         begun = self._nowhere()
         if self.stepper is not None:
             seeds_of_each = [np.random.SeedSequence(int(seed)).generate_state(self._shape[1]) for seed in np.asarray(seeds)]
             begun = self._begin(np.concatenate(seeds_of_each))
-        return self._program("start")(seeds, demonstrations, self._put(begun), self.values)
+        return self._programs["start"](seeds, demonstrations, self._put(begun), self.values)
 
     def collect(self, state: TrainState, guidance: Guidance) -> TrainState:
         for _ in range(self.warm_up):
@@ -111,7 +110,7 @@ class HostPrograms(Programs):
         return state
 
     def imitate(self, state: TrainState, guidance: Guidance, practice: Practice) -> tuple[TrainState, list[Params]]:
-        return self._program("imitate")(state, guidance, practice, self.values)
+        return self._programs["imitate"](state, guidance, practice, self.values)
 
     def practise(self, state: TrainState, guidance: Guidance, practice: Practice) -> tuple[Practice, Attempts]:
         """As `core.imitation.practise`, a few starts after the other: as many as there are environments for each run."""
@@ -138,13 +137,13 @@ class HostPrograms(Programs):
 
     def learn(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, Metrics]:
         if self.stepper is None:
-            return self._program("clone")(state, guidance, self.values)
+            return self._programs["clone"](state, guidance, self.values)
         if not self._begun:
             state = self._with_new_episodes(state, guidance)
         of_each = []
         for _ in range(self.chunk):
             state, plan = self._planned(state, at_random=False)
-            state, metrics = self._program("improve")(state, plan, guidance, self.values)  # comes back at once; computes while environments step
+            state, metrics = self._programs["improve"](state, plan, guidance, self.values)  # comes back at once; computes while environments step
             state = self._stepped(state, plan, guidance)
             of_each.append(metrics)
         return state, jax.tree.map(lambda *values: np.mean(values, axis=0), *jax.device_get(of_each))
@@ -156,13 +155,13 @@ class HostPrograms(Programs):
 
     def _planned(self, state: TrainState, *, at_random: bool) -> tuple[TrainState, Plan]:
         explorer = policy(state.agent, self.config, average=False)
-        key, plan = self._program("decide_at_random" if at_random else "decide")(state.key, explorer, state.rollout, self.values)
+        key, plan = self._programs["decide_at_random" if at_random else "decide"](state.key, explorer, state.rollout, self.values)
         return state.replace(key=key), plan
 
     def _stepped(self, state: TrainState, plan: Plan, guidance: Guidance) -> TrainState:
         """Takes the planned step in all environments and remembers it."""
         outcome = self.stepper.step(np.asarray(plan.env_action).reshape(-1, self.env.action_dim))
-        return self._program("remember")(state, plan, self._put(self._taken(outcome)), guidance, self.values)
+        return self._programs["remember"](state, plan, self._put(self._taken(outcome)), guidance, self.values)
 
     def _taken(self, outcome: Outcome) -> tuple[TimeStep, RolloutState]:
         """The step that an outcome tells of, and where the environments are now; leaves (S, E, ...)."""

@@ -7,9 +7,9 @@ environments are stepped outside JAX.
 from __future__ import annotations
 
 import abc
+import contextlib
 import functools
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
@@ -36,14 +36,14 @@ FRESH_EPISODES = 100
 CHUNKS_PER_EVALUATION = 10
 Values = dict[str, Array]
 """The swept fields of the config, and their values: of one run, or (S,)."""
-_RUN_ONCE: dict[str, Any] = {"xla_backend_optimization_level": 0}  # for programs whose compilation takes longer than their one run
+Compile = Callable[..., Future[Any]]
+_RUN_ONCE = {"xla_backend_optimization_level": 0}  # for programs whose compilation takes longer than their one run
 
 
 class Programs(abc.ABC):
     """The programs of an experiment. What they take and return has leaves (S, ...), S runs.
 
-    A config may have swept fields, in which its runs differ; the programs hold the values. They are compiled side by side, in the order in which they
-    are wanted, and are waited for when they are: while a clone plays, learning may still be being compiled.
+    A config may have swept fields, in which its runs differ; the programs hold the values.
     """
 
     env: Environment
@@ -54,11 +54,9 @@ class Programs(abc.ABC):
     """Environment steps of `collect`."""
     shapes: dict[str, Any]
     """Of guidance, state and key, as `start` returns them."""
-    seconds_waited: float = 0.0
-    """For programs that were wanted before they were compiled."""
 
     def __init__(self, env: Environment, configs: Sequence[TrainConfig], demonstrations: Episodes):
-        """Traces everything and begins to compile it.
+        """Compiles everything.
 
         Args:
           env: the task.
@@ -73,13 +71,12 @@ class Programs(abc.ABC):
         self.steps_at_random = self.warm_up * self.config.steps_per_iteration
         self.mesh = seed_mesh(num_seeds)
         values = {name: np.asarray([sweepable_value(config, name) for config in configs], np.float32) for name in swept_fields(configs)}
-        self._pool, self._pending = ThreadPoolExecutor(), dict[str, Future[Any]]()
         self._compile(shapes_on((jax.ShapeDtypeStruct((num_seeds,), np.uint32), demonstrations), self.mesh), shapes_on(values, self.mesh))
         self.values: Values = spread(values, self.mesh)
 
     @abc.abstractmethod
     def _compile(self, given: tuple[Any, Any], values: Any) -> None:
-        """Begins to compile everything from shapes: those of seeds and demonstrations, and of the swept values."""
+        """Compiles everything from shapes: those of seeds and demonstrations, and of the swept values."""
 
     @abc.abstractmethod
     def start(self, seeds: Array, demonstrations: Episodes) -> tuple[Guidance, TrainState, Array]:
@@ -110,20 +107,21 @@ class Programs(abc.ABC):
     def evaluate(self, key: Array, policy: Policy, guidance: Guidance, num_episodes: int) -> tuple[Array, Evaluation]:
         """Plays fresh episodes: `eval_episodes` of the config, or `FRESH_EPISODES`. Returns the keys of later ones, too."""
 
-    def close(self) -> None:
-        """Compiles no more, and closes environments that are not stepped in JAX."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
+    def close(self) -> None:  # noqa: B027, there is nothing to end where JAX steps the environments
+        """Closes the environments."""
 
-    def _submit(self, name: str, traced: Any, *, learns: bool = False, **options: Any) -> None:
-        """Has a thread compile a program while the next one is being traced; `learns` says that it is mostly gradient steps."""
-        self._pending[name] = self._pool.submit(traced.lower().compile, compiler_options(self.env, learns=learns) | options)
+    @contextlib.contextmanager
+    def _compiler(self) -> Iterator[Compile]:
+        """A function compile(traced, learns, options) that hands a program to a thread, which compiles it while the next one is being traced.
 
-    def _program(self, name: str) -> Callable[..., Any]:
-        """A compiled program."""
-        began = time.perf_counter()
-        program = self._pending[name].result()
-        self.seconds_waited += time.perf_counter() - began
-        return program
+        `learns` says that it is mostly gradient steps.
+        """
+        with ThreadPoolExecutor() as pool:
+
+            def compile_(traced: Any, *, learns: bool = False, **options: Any) -> Future[Any]:
+                return pool.submit(traced.lower().compile, compiler_options(self.env, learns=learns) | options)
+
+            yield compile_
 
     def _trace(self, function: Callable[..., Any], *shapes: Any, donate: bool = False, **static: Any) -> Any:
         """A function of one run, traced for all of them. The last shapes are those of the swept values, which it finds in its config."""
@@ -135,14 +133,12 @@ class Programs(abc.ABC):
 
         return jax.jit(over_seeds(of_one_run, self.mesh), donate_argnums=0 if donate else ()).trace(*shapes)
 
-    def _submit_imitation(self, state: Any, guidance: Any, values: Any) -> Any:
-        """Begins to compile `imitate`, which takes place in JAX whatever steps the environment; returns the shapes of a practice."""
+    def _trace_imitation(self, state: Any, guidance: Any, values: Any) -> dict[str, Any]:
+        """The traced programs of the imitating policy that take place in JAX, whatever steps the environment."""
         of_one_run = jax.eval_shape(functools.partial(imitation.no_practice, self.env))
         num_runs = state.env_steps.shape[0]
         self._practice = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((num_runs, *leaf.shape), leaf.dtype), of_one_run)
-        practice = shapes_on(self._practice, self.mesh)
-        self._submit("imitate", self._trace(imitation.imitate, state, guidance, practice, values, donate=True))
-        return practice
+        return {"imitate": self._trace(imitation.imitate, state, guidance, shapes_on(self._practice, self.mesh), values, donate=True)}
 
     def _trace_start(self, function: Callable[..., Any], *shapes: Any) -> tuple[Any, Any, Any, Any]:
         """The traced start, and the shapes of guidance, state and key, which fit into the memory.
@@ -174,37 +170,40 @@ class JaxPrograms(Programs):
 
     def _compile(self, given: tuple[Any, Any], values: Any) -> None:
         config = self.config
-        starting, guidance, state, key = self._trace_start(start, *given, None, values)
-        actor, rest = policy(state.agent, config, average=True), (guidance, values)
-        self._submit("start", starting, **_RUN_ONCE)
-        if config.imitation_steps > 0:
-            practice = self._submit_imitation(state, *rest)
-        for num_episodes in dict.fromkeys((config.eval_episodes, FRESH_EPISODES)):
-            self._submit(f"evaluate {num_episodes}", self._trace(evaluate, key, actor, *rest, num_episodes=num_episodes))
-        if config.imitation_steps > 0 and config.practice_rounds > 0:
-            self._submit("practise", self._trace(imitation.practise, state, guidance, practice, values))
-        if config.learns_from_rollouts:
-            self._submit("collect", self._trace(training.collect, state, *rest, donate=True, num_iterations=self.warm_up), **_RUN_ONCE)
-        function = training.learn if config.learns_from_rollouts else training.clone
-        self._submit("learn", self._trace(function, state, *rest, donate=True, num_iterations=self.chunk), learns=True)
+        with self._compiler() as compile_:
+            starting, guidance, state, key = self._trace_start(start, *given, None, values)
+            actor, rest = policy(state.agent, config, average=True), (guidance, values)
+            function = training.learn if config.learns_from_rollouts else training.clone
+            pending = {"learn": compile_(self._trace(function, state, *rest, donate=True, num_iterations=self.chunk), learns=True)}
+            pending["start"] = compile_(starting, **_RUN_ONCE)
+            for num_episodes in {config.eval_episodes, FRESH_EPISODES}:
+                pending[f"evaluate {num_episodes}"] = compile_(self._trace(evaluate, key, actor, *rest, num_episodes=num_episodes))
+            if config.learns_from_rollouts:
+                pending["collect"] = compile_(self._trace(training.collect, state, *rest, donate=True, num_iterations=self.warm_up), **_RUN_ONCE)
+            if config.imitation_steps > 0:
+                traced = self._trace_imitation(state, *rest)
+                if config.practice_rounds > 0:
+                    traced["practise"] = self._trace(imitation.practise, state, guidance, shapes_on(self._practice, self.mesh), values)
+                pending |= {name: compile_(program) for name, program in traced.items()}
+            self._programs = {name: program.result() for name, program in pending.items()}
 
     def start(self, seeds: Array, demonstrations: Episodes) -> tuple[Guidance, TrainState, Array]:
-        return self._program("start")(seeds, demonstrations, None, self.values)
+        return self._programs["start"](seeds, demonstrations, None, self.values)
 
     def collect(self, state: TrainState, guidance: Guidance) -> TrainState:
-        return self._program("collect")(state, guidance, self.values)
+        return self._programs["collect"](state, guidance, self.values)
 
     def imitate(self, state: TrainState, guidance: Guidance, practice: Practice) -> tuple[TrainState, list[Params]]:
-        return self._program("imitate")(state, guidance, practice, self.values)
+        return self._programs["imitate"](state, guidance, practice, self.values)
 
     def practise(self, state: TrainState, guidance: Guidance, practice: Practice) -> tuple[Practice, Attempts]:
-        return self._program("practise")(state, guidance, practice, self.values)
+        return self._programs["practise"](state, guidance, practice, self.values)
 
     def learn(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, Metrics]:
-        return self._program("learn")(state, guidance, self.values)
+        return self._programs["learn"](state, guidance, self.values)
 
     def evaluate(self, key: Array, policy: Policy, guidance: Guidance, num_episodes: int) -> tuple[Array, Evaluation]:
-        return self._program(f"evaluate {num_episodes}")(key, policy, guidance, self.values)
+        return self._programs[f"evaluate {num_episodes}"](key, policy, guidance, self.values)
 
 
 def extent(env: Environment, config: TrainConfig) -> tuple[int, int]:

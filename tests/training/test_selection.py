@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +14,7 @@ import hindrl_jax as hindrl
 from hindrl_jax.core.imitation import NOISES, NUM_STARTS, Attempts
 from hindrl_jax.core.rollout import Evaluation
 from hindrl_jax.runs.checkpoints import Checkpoints
-from hindrl_jax.training.experiment import Diverged, _clock, _worth
-from hindrl_jax.training.programs import FRESH_EPISODES, JaxPrograms
+from hindrl_jax.training.experiment import Diverged, _worth
 from hindrl_jax.training.selection import CHOICE_ROUNDS, NUM_KEPT, Moment, Trial, better, choose, keep, nothing_kept
 
 NOBODY = np.zeros(1, bool)
@@ -274,23 +272,6 @@ def test_a_clone_that_is_good_enough_is_returned_and_nothing_else_is_tried(clone
     summary = cloned.summaries()[0]
     assert (summary.cloned_success, summary.returned_env_steps, summary.returned_updates) == (1.0, 0, 0)
     assert summary.final_success == 1.0  # one that knows nothing, which learning would have begun with, arrives, too
-
-
-def test_a_clone_that_is_good_enough_does_not_wait_for_learning_to_be_compiled(monkeypatch):
-    wanted, program = set(), JaxPrograms._program
-    monkeypatch.setattr(JaxPrograms, "_program", lambda programs, name: wanted.add(name) or program(programs, name))
-    result = fit(CLONING, easily_imitated())
-    assert result.kept.all_confirmed
-    assert wanted == {"start", "imitate", *(f"evaluate {number}" for number in (CLONING.eval_episodes, FRESH_EPISODES))}
-
-
-def test_seconds_of_training_are_not_those_of_waiting_for_a_program():
-    programs = SimpleNamespace(seconds_waited=0.0)
-    clock = _clock(programs, 500.0)
-    before = clock()
-    programs.seconds_waited = 100.0
-    assert 500.0 <= before < 550.0
-    assert 400.0 <= clock() < 450.0
 
 
 def test_practice_makes_a_clone_faster_than_its_demonstrations():
