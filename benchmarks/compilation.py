@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.experimental.compilation_cache import compilation_cache
 
 import hindrl_jax
 from benchmarks import report, timing
@@ -103,10 +104,12 @@ def without_kept_programs() -> Iterator[None]:
     """Compiles what an earlier run has already compiled."""
     before = jax.config.jax_enable_compilation_cache
     jax.config.update("jax_enable_compilation_cache", False)
+    compilation_cache.reset_cache()  # else JAX remembers that there is one
     try:
         yield
     finally:
         jax.config.update("jax_enable_compilation_cache", before)
+        compilation_cache.reset_cache()
 
 
 def tables(rows: list[Row]) -> str:

@@ -29,11 +29,12 @@ def in_float32(function: Callable[P, R]) -> Callable[P, R]:
 def without_fusion_emitters() -> dict[str, Any]:
     """Options with which XLA compiles a program in half the time on CPUs, without its newer code that fuses operations.
 
-    What plays episodes runs as fast or faster then; gradient steps, whose time goes into what is fused between products of matrices, run slower
-    (`benchmarks/compilation.py`). From jaxlib 0.11.1 on, XLA has no such option.
+    What plays episodes runs as fast or faster then, and so does cloning; the gradient steps of reinforcement learning run slower
+    (`benchmarks/compilation.py`). There are none where XLA_FLAGS says something about it, and from jaxlib 0.11.1 on, whose XLA has no such option.
     """
-    has_option = jax.default_backend() == "cpu" and jax.__version_info__ < (0, 11, 1)
-    return {"xla_cpu_use_fusion_emitters": False} if has_option else {}
+    option = "xla_cpu_use_fusion_emitters"
+    is_chosen = option in os.environ.get("XLA_FLAGS", "")
+    return {} if is_chosen or jax.default_backend() != "cpu" or jax.__version_info__ >= (0, 11, 1) else {option: False}
 
 
 def keep_compiled_programs() -> None:

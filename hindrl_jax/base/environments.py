@@ -90,8 +90,8 @@ def holds_goal(env: Environment) -> bool:
 
 
 def compiler_options(env: Environment, *, learns: bool = False) -> dict[str, Any]:
-    """Options of XLA for a program that steps this environment, for `jax.jit` or `compile`: those that it needs, of which most need none, and those
-    with which the program compiles sooner, unless it `learns`: is mostly gradient steps.
+    """Options of XLA for a program of this environment, for `jax.jit` or `compile`: those that it needs, of which most need none, and those with
+    which the program compiles sooner, unless it `learns`: is mostly gradient steps of reinforcement learning.
     """
     return ({} if learns else without_fusion_emitters()) | getattr(env, "compiler_options", {})
 

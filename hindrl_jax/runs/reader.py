@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import itertools
 import os
 import shlex
 from collections.abc import Callable, Sequence
@@ -225,16 +226,18 @@ def draw_episodes(path: Path, env: Environment, episodes: Sequence[np.ndarray]) 
     check_film(path, len(episodes))
     if not isinstance(env, Restorable):
         raise UserError(f"demonstrations of {env.name} hold no states, so they cannot be drawn; `hindrl render` films the policies of a run")
-    for states in episodes:
-        if states.shape[-1] != env.state_dim:
-            raise UserError(f"states of {states.shape[-1]} numbers are not those of {env.name}, which has {env.state_dim}: record them again")
-    unpacked = [_unpacked(env, states) for states in episodes]
+    for vectors in episodes:
+        if vectors.shape[-1] != env.state_dim:
+            raise UserError(f"states of {vectors.shape[-1]} numbers are not those of {env.name}, which has {env.state_dim}: record them again")
+    if path.suffix == ".png":
+        episodes = [episodes[-1][-1:]]
+    unpacked = iter(_unpacked(env, np.concatenate(episodes)))
     with disk_trouble(path):
-        save_film(env, unpacked, path)
+        save_film(env, [list(itertools.islice(unpacked, len(episode))) for episode in episodes], path)
 
 
 def _unpacked(env: Restorable, vectors: np.ndarray) -> list[Any]:
-    """The states that vectors (T, S) give, with numpy leaves and all with the same key, in one program."""
+    """The states that vectors (T, S) give, with numpy leaves and all with the same key, by one program."""
     key = jax.random.key(0)
     unpack = jax.jit(jax.vmap(lambda vector: env.vector_to_state(key, vector)), compiler_options=compiler_options(env))
     leaves, structure = jax.tree.flatten(unpack(vectors))

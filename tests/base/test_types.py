@@ -50,7 +50,8 @@ def test_protocols(env):
 
 
 def test_options_of_the_compiler(monkeypatch):
-    """On CPUs all but gradient steps compile without the fusion emitters, where they can be turned off, and MJX always does."""
+    """On CPUs all but gradient steps compile without the fusion emitters, where they can be turned off and nobody has chosen; MJX always does."""
+    monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=0")
     plain = [Corridor(), GridPickAndPlace(), FixedParameterizedReach(), FixedParameterizedReach(backend="robosuite")]
     on_mjx = ParameterizedReach(backend="mjx")
     scheduler, emitters = {"xla_cpu_enable_concurrency_optimized_scheduler": False}, {"xla_cpu_use_fusion_emitters": False}
@@ -64,3 +65,6 @@ def test_options_of_the_compiler(monkeypatch):
         assert [compiler_options(env) for env in plain] == [of_plain] * 4
         assert [compiler_options(env, learns=True) for env in plain] == [{}] * 4
         assert compiler_options(on_mjx) == compiler_options(on_mjx, learns=True) == of_mjx
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=true")
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    assert [compiler_options(env) for env in plain] == [{}] * 4

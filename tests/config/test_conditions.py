@@ -227,7 +227,9 @@ IN_ALL = ("hindrl", "bc")
 IN_OFTEN = ("tqcfd", "joint_union with sac and one critic", "future with redq, residual", "no demonstration rows, proposals of a clone", "no cloning")
 FAST = {name: VALUES.keys() for name in IN_ALL} | {name: OFTEN for name in IN_OFTEN}
 TRIED = [pytest.param(name, fields, id=name) for name, fields in FAST.items()]
-TRIED += [pytest.param(name, VALUES.keys() - FAST.get(name, set()), id=f"{name}, the rest", marks=pytest.mark.slow) for name in BASES]
+TRIED += [
+    pytest.param(name, VALUES.keys() - FAST.get(name, set()), id=f"{name}, the rest", marks=pytest.mark.slow) for name in BASES if name not in IN_ALL
+]
 
 
 # Parts of the program in which most fields of a section show.

@@ -1,4 +1,4 @@
-"""The type checker has nothing to say, as in `make lint`, and knows what the package shows."""
+"""The type checker knows what the package shows; what it has to say about the package itself, `make lint` tells."""
 
 import ast
 import subprocess

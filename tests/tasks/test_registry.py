@@ -120,7 +120,7 @@ def test_the_states_of_a_film_are_unpacked_together(forget, tmp_path, monkeypatc
     monkeypatch.setattr(type(env), "vector_to_state", lambda *given: calls.append(1) or unpack(*given))
     register(type(env), viewer=Viewer)
     vectors = np.array([[0.1 * step, 0.2, 0.3, 0.0] for step in range(6)], np.float32)
-    draw_episodes(tmp_path / "film.gif", env, [vectors])
+    draw_episodes(tmp_path / "film.gif", env, [vectors[:2], vectors[2:]])
     assert len(calls) == 1
     np.testing.assert_array_equal([env.state_to_vector(state) for state in drawn], vectors)
     assert all(isinstance(leaf, np.ndarray | np.generic) for leaf in jax.tree.leaves(drawn) if not jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key))
