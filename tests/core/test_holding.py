@@ -114,7 +114,7 @@ def test_a_held_environment_is_able_to_do_what_its_own_is():
         assert can_step(held)
         assert isinstance(held, Restorable)
         assert isinstance(held, RelabelsObservations) == relabels
-        assert compiler_options(held) == options
+        assert compiler_options(held, learns=True) == options
         assert state_dim(held) == 3
         assert (held.name, held.observation_dim, held.action_dim, held.action_high) == ("Corridor", 3, 2, 2.0)
     assert (able.env, able.num_held) == (AbleCorridor(), 2)

@@ -97,9 +97,9 @@ def test_recorded_episodes_are_what_the_environment_makes_of_their_actions(env):
 
 @pytest.mark.parametrize("success", ["reached", "held"])
 def test_a_clone_practises_where_environments_are_stepped_outside_jax(env, success):
-    """Three environments for each run, so that the last starts of a round are fewer than these."""
+    """Seven environments for each run, so that the last starts of a round are fewer than these."""
     judged = dataclasses.replace(env, success=success)
-    config = dataclasses.replace(CONFIG, imitation_steps=90, practice_rounds=2, num_envs=3, steps=120)
+    config = dataclasses.replace(CONFIG, imitation_steps=90, practice_rounds=2, num_envs=7, steps=120)
     result = hindrl.fit(judged, record_gymnasium(judged, to_goal, 5, seed=1), config, seeds=[0, 1])
     assert (result.practised_success >= 0.5).any()
     attempts = NUM_STARTS * len(NOISES)
