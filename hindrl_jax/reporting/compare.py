@@ -84,6 +84,8 @@ def remarks(compared: Sequence[Comparison]) -> list[str]:
             done, unit = (run.updates, "updates") if run.cloning else (run.env_steps, "steps")
             moment = f"{done[-1]:,} of {run.spec.config.num_steps:,} {unit}"
             lines.append(f"{run.label} is not finished: its success is that of the evaluation at {moment}")
+        if run.ended_with_clones:
+            lines.append(f"{run.label} ended with clones, before its method learnt anything: to compare methods, train with --imitation-steps 0")
     if len({(run.spec.env.name, json.dumps(dataclasses.asdict(run.spec.env), default=str)) for run in runs}) > 1:
         lines.append("the runs are of different environments: what they differ by is the task as well as the method")
     if any(run.cloning for run in runs) and not all(run.cloning for run in runs):

@@ -27,7 +27,7 @@ class RecordedRun:
     """A short name; those of runs that are read together differ."""
     spec: RunSpec
     env_steps: np.ndarray
-    """(E,) environment steps of each seed; 0 for bc."""
+    """(E,) environment steps of each seed, the most that one took where clones have practised for different times; 0 for bc."""
     updates: np.ndarray
     """(E,) gradient steps of each seed."""
     seconds: np.ndarray
@@ -41,6 +41,13 @@ class RecordedRun:
     train_seconds: float
     """Of the whole training so far, evaluations included and compilation not."""
     finished: bool
+    steps_of_seeds: np.ndarray | None = None
+    """(E, S) environment steps of each seed, where they are not the same for all."""
+
+    @property
+    def ended_with_clones(self) -> bool:
+        """Whether the run was over before it learnt anything, since its clones were good enough."""
+        return self.finished and not self.cloning and int(self.updates[-1]) == 0
 
     @property
     def cloning(self) -> bool:
@@ -53,8 +60,10 @@ class RecordedRun:
 
     def to_95(self, over: Axis) -> np.ndarray:
         """(S,) where each seed's first evaluation at 95% stands; infinite where there is none."""
-        reached = self.success >= SOLVED
-        return np.where(reached.any(axis=0), self.axis(over)[reached.argmax(axis=0)], np.inf)
+        reached, along = self.success >= SOLVED, np.broadcast_to(self.axis(over)[:, None], self.success.shape)
+        if over == "steps" and self.steps_of_seeds is not None:
+            along = self.steps_of_seeds
+        return np.where(reached.any(axis=0), np.take_along_axis(along, reached.argmax(axis=0)[None], axis=0)[0], np.inf)
 
 
 def read_recorded(path: Path, label: str | None = None) -> RecordedRun:
@@ -85,7 +94,7 @@ def read_recorded(path: Path, label: str | None = None) -> RecordedRun:
         path=path,
         label=path.name if label is None else label,
         spec=spec,
-        env_steps=columns["env_steps"][:, 0].astype(int),
+        env_steps=columns["env_steps"].max(axis=1).astype(int),
         updates=columns["updates"][:, 0].astype(int),
         seconds=columns["seconds"][:, 0],
         success=columns["success"],
@@ -93,15 +102,18 @@ def read_recorded(path: Path, label: str | None = None) -> RecordedRun:
         returned_success=columns["success"][-1] if final is None else final,
         train_seconds=float(columns["seconds"][-1, 0]) if total is None else total,
         finished=final is not None,
+        steps_of_seeds=columns["env_steps"],
     )
 
 
 def _whole_evaluations(text: str, seeds: tuple[int, ...]) -> dict[str, Any]:
-    """Columns (E, S) of the metrics, of those evaluations that hold all seeds, in order of the seeds."""
+    """Columns (E, S) of the metrics, of those evaluations that hold all seeds, in order of the seeds. That before learning is one, after however many
+    steps of practice each seed was found good enough."""
     lines = text[: text.rfind("\n") + 1].splitlines()  # what follows the last line's end is still being written
     evaluations: dict[tuple[int, int], dict[int, dict[str, str]]] = {}
     for row in csv.DictReader(lines):
-        evaluations.setdefault((int(row["env_steps"]), int(row["updates"])), {})[int(row["seed"])] = row
+        steps, updates = int(row["env_steps"]), int(row["updates"])
+        evaluations.setdefault((steps if updates else 0, updates), {})[int(row["seed"])] = row
     whole = [[rows[seed] for seed in seeds] for rows in evaluations.values() if set(rows) == set(seeds)]
     others = [name for name in (whole[0][0] if whole else ()) if name not in ("seed", *_NEEDED)]
     columns: dict[str, Any] = {name: np.asarray([[float(row[name]) for row in rows] for rows in whole]) for name in _NEEDED}

@@ -86,6 +86,18 @@ def test_bc_counts_gradient_steps(first, tmp_path):
     assert "bc takes no environment steps: its steps are gradient steps" in remarks([_, bc])
 
 
+def test_clones_that_were_good_enough_count_the_steps_of_their_practice(first, tmp_path):
+    """Each seed's own, and that they are clones is said: the methods were not compared."""
+    clones = write(tmp_path / "clones", [[0.96], [1.0]], final=[0.95, 1.0])
+    (clones / "metrics.csv").write_text("seed,env_steps,updates,seconds,success,episode_length\n0,60,0,7,0.96,9\n1,0,0,7,1,9\n")
+    run, other = compare(read_runs([clones, first]))
+    assert (run.seeds_reaching_95, run.steps_to_95, run.seconds_to_95) == (2, 30.0, 7.0)
+    assert run.run.env_steps.tolist() == [60]
+    said = "clones ended with clones, before its method learnt anything: to compare methods, train with --imitation-steps 0"
+    assert said in remarks([run, other])
+    assert said not in remarks([other])
+
+
 def test_what_few_seeds_cannot_tell_is_said(first, tmp_path):
     alone = write(tmp_path / "alone", [[1.0]], final=[1.0], seeds=(0,))
     lacking, narrow = (
