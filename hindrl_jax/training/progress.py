@@ -166,12 +166,16 @@ def practice_line(success: np.ndarray, steps: np.ndarray) -> str:
 
 
 def evaluation_line(rows: Sequence[Row]) -> str:
-    """One line on one evaluation, from the rows of all seeds: by mean actions, and by sampled ones where those were played, too."""
+    """One line on one evaluation, from the rows of all seeds: by mean actions, and by sampled ones where those were played, too.
+
+    Its steps are the most that a seed took: clones practise for different times.
+    """
     success = [row.success for row in rows]
     sampled = [row.sampled_success for row in rows if row.sampled_success is not None]
     spread = f" (worst {min(success):4.0%})" if len(rows) > 1 else ""
     spread += f"   sampled {np.mean(sampled):4.0%}" if sampled else ""
-    steps = f"{rows[0].env_steps:9,d} steps " if rows[0].env_steps else ""  # bc takes none
+    env_steps = max(row.env_steps for row in rows)
+    steps = f"{env_steps:9,d} steps " if env_steps else ""  # bc takes none
     return (
         f"{steps}{rows[0].updates:8,d} updates {rows[0].seconds:7.1f} s   "
         f"success {np.mean(success):4.0%}{spread}   length {np.mean([row.episode_length for row in rows]):5.1f}"

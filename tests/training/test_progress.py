@@ -70,6 +70,11 @@ def test_what_sampled_actions_solve_stands_beside():
     assert evaluation_line(rows) == "      100 steps      100 updates     1.0 s   success   2% (worst   1%)   sampled  75%   length  50.0"
 
 
+def test_the_steps_of_an_evaluation_are_the_most_that_a_seed_took():
+    rows = [dataclasses.replace(row, env_steps=steps) for row, steps in zip(result(100).rows, (0, 1_700), strict=True)]
+    assert evaluation_line(rows).split(" steps ")[0].strip() == "1,700"
+
+
 def test_each_round_of_practice_has_a_line():
     screen, rounds = console(), [(0, None), (0, None), (1_000, [0.5, 0.75]), (1_000, [0.5, 0.75]), (2_500, [1.0, 0.75]), (4_000, [1.0, 0.75])]
     progress = hindrl.ProgressBar(console=screen)
