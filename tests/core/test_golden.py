@@ -24,13 +24,15 @@ from hindrl_jax.core.guidance import guidance
 
 FILE = Path(__file__).parent.parent / "data" / "golden.json"
 NUM_UPDATES = 20
-GRID, RANDOM_REACH = "FixedGridPickAndPlace", "ParameterizedReach"
+GRID, REACH, RANDOM_REACH = "FixedGridPickAndPlace", "FixedParameterizedReach", "ParameterizedReach"
 CASES = {  # environment, model and kind of preset
     "grid-bc": (GRID, "bc", "default"),
     "grid-tqcfd": (GRID, "tqcfd", "default"),
     "grid-hindrl": (GRID, "hindrl", "default"),
     "grid-smooth-hindrl": (GRID, "smooth-hindrl", "default"),
+    "reach-hindrl": (REACH, "hindrl", "default"),
     "random-reach": (RANDOM_REACH, "hindrl", "default"),
+    "thesis-grid-hindrl": (GRID, "hindrl", "thesis"),
     "original-grid-hindrl": (GRID, "hindrl", "original"),
 }
 
@@ -81,7 +83,11 @@ def run(case):
     return {f"{case} {name}": np.atleast_1d(values).tolist() for name, values in metrics.items()}
 
 
-@pytest.mark.parametrize("case", CASES)
+# What these run is run by the others, too, nearly all of it.
+SELDOM = ("reach-hindrl", "thesis-grid-hindrl")
+
+
+@pytest.mark.parametrize("case", [pytest.param(case, marks=pytest.mark.slow) if case in SELDOM else case for case in CASES])
 def test_the_first_updates_are_what_they_were(case):
     recorded = {name: values for name, values in json.loads(FILE.read_text()).items() if name.split()[0] == case}
     found = run(case)
