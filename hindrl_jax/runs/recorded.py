@@ -42,7 +42,7 @@ class RecordedRun:
     """Of the whole training so far, evaluations included and compilation not."""
     finished: bool
     steps_of_seeds: np.ndarray | None = None
-    """(E, S) environment steps of each seed, where they are not the same for all."""
+    """(E, S) environment steps of each seed; None where all have taken as many."""
 
     @property
     def ended_with_clones(self) -> bool:

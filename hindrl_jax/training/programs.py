@@ -114,7 +114,7 @@ class Programs(abc.ABC):
     def _compiler(self) -> Iterator[Compile]:
         """A function compile(traced, learns, options) that hands a program to a thread, which compiles it while the next one is being traced.
 
-        `learns` says that it is mostly gradient steps of reinforcement learning.
+        `learns` says that it is what a run spends most of its gradient steps in.
         """
         with ThreadPoolExecutor() as pool:
 
