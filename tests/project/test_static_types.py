@@ -51,10 +51,18 @@ def test_names_are_there_and_documented(name):
     assert name == "__version__" or f"[`{name}`]" in (ROOT / "docs" / "api" / "outside.md").read_text()
 
 
+def loaded_by(module):
+    code = f"import sys; before = set(sys.modules); import {module}; print(*sorted(set(sys.modules) - before))"
+    return subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
+
+
+def test_a_command_starts_without_what_only_some_commands_need():
+    assert {"scipy.stats", "matplotlib", "mujoco", "orbax", "PIL"} & set(loaded_by("hindrl_jax.cli")) == set()
+
+
 def test_importing_the_package_loads_nothing_large():
     """Gymnasium, whose registry learns our ids, is the largest."""
-    code = "import sys; before = set(sys.modules); import hindrl_jax; print(*sorted(set(sys.modules) - before))"
-    loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
+    loaded = loaded_by("hindrl_jax")
     large = {"jax", "jaxlib", "flax", "optax", "chex", "h5py", "matplotlib", "mujoco", "orbax", "PIL"}
     assert {name.partition(".")[0] for name in loaded} & large == set()
     own = [name for name in loaded if name.startswith("hindrl_jax.")]
