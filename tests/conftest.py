@@ -1,4 +1,4 @@
-"""Strict settings for every test: no silent broadcasting between ranks, no random key consumed twice.
+"""Strict settings for every test: no silent broadcasting between ranks, and, where programs are looked at, no random key consumed twice.
 
 Programs of tests are small and run for an instant, so that most of the time goes into compiling them. A program is compiled once for all tests, test
 processes and processes that tests start, and kept in `.pytest_cache` for later runs; in the fast tests the compiler is set to optimise it little.
@@ -18,12 +18,12 @@ import psutil
 import pytest
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
-jax.config.update("jax_debug_key_reuse", True)
 
 QUICK = ["--xla_backend_optimization_level=0", "--xla_llvm_disable_expensive_passes=true"]
 # Without the emitters, programs compile in a third of the time and memory, and in one piece a seventh sooner than in many. Not every version of the
 # compiler knows these two flags, and it stops at one that it does not know.
 WHERE_KNOWN = ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
+PROGRAMS = ("core", "envs", "experts", "tasks", "training")  # folders of tests; what all others train or play are programs of these
 LONGEST = [f"test_{name}.py" for name in ("notebooks", "docs", "devices", "options", "golden", "checkpoints", "solves_a_task")]
 ENOUGH = 1e9  # bytes of a test process
 KEPT = 14 * 24 * 3600  # seconds after which a compiled program that no test used is deleted
@@ -67,6 +67,12 @@ def pytest_collection_finish():
     """Python looks for garbage less often, and not among modules and tests, which stay: tracing makes many objects and hardly any cycles."""
     gc.freeze()
     gc.set_threshold(20_000, 50, 100)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def random_keys_are_consumed_once(request):
+    """Takes a fifth of the time of a test that traces programs."""
+    jax.config.update("jax_debug_key_reuse", request.path.parent.name in PROGRAMS)
 
 
 @pytest.fixture(scope="module", autouse=True)
