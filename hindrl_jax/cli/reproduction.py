@@ -26,7 +26,7 @@ from hindrl_jax.reproduction.thesis import ARTIFACTS
 from hindrl_jax.runs.recorded import read_recorded
 from hindrl_jax.tasks.registry import did_you_mean
 from hindrl_jax.training.checks import steps_to_learn
-from hindrl_jax.training.experiment import Diverged
+from hindrl_jax.training.evaluating import Diverged
 from hindrl_jax.training.result import Result
 
 

@@ -36,7 +36,8 @@ from hindrl_jax.runs.writer import RunWriter
 from hindrl_jax.tasks.checking import check_environment
 from hindrl_jax.tasks.registry import full_name
 from hindrl_jax.training.checks import check_demonstrations, check_memory
-from hindrl_jax.training.experiment import Diverged, fit
+from hindrl_jax.training.evaluating import Diverged
+from hindrl_jax.training.experiment import fit
 from hindrl_jax.training.progress import ProgressBar
 from hindrl_jax.training.recording import record_demonstrations
 from hindrl_jax.training.result import Result

@@ -18,6 +18,7 @@ called. What differs between tasks follows from what they are and from the demon
                            they have parameters of the task in their observations half of them, with goals of demonstrations and rollouts; where
                            all aim at the same, a fifth, with goals of demonstrations: there, other goals are not what is to be learnt, and take
                            rows of the batch
+    practice               where all episodes aim at the same; where each is another task, 32 episodes of practice say too little about the others
     the goal as an input   what is left to it, desired less achieved, where episodes have goals of their own; else the goal
     target entropy         counts per action dimension
     random steps           one horizon in each environment
@@ -92,7 +93,8 @@ def _default(algo: Algorithm, env: Environment) -> TrainConfig:
     if algo == "bc":
         agent = AgentConfig(net_arch=IMITATION_NET_ARCH)
         return TrainConfig(algo="bc", steps=1_500, eval_every=250, batch=BatchConfig(n_step=1), goal=goal, agent=agent)
-    return TrainConfig(imitation_steps=_IMITATION_STEPS, practice_rounds=_PRACTICE_ROUNDS, goal=goal, batch=_batch(env))
+    practice_rounds = 0 if gives_goals(env) or isinstance(env, RelabelsObservations) else _PRACTICE_ROUNDS
+    return TrainConfig(imitation_steps=_IMITATION_STEPS, practice_rounds=practice_rounds, goal=goal, batch=_batch(env))
 
 
 def _batch(env: Environment) -> BatchConfig:

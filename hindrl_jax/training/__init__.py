@@ -2,7 +2,9 @@
 
 Environments are asked what they can do (`hindrl_jax.base`), never of what kind they are.
 
-    experiment      fit: the loop between the programs, with evaluations
+    experiment      fit: the loop between the programs
+    imitating       what comes before it: clones of the demonstrations, and their practice
+    evaluating      evaluations along it, and what is returned in the end
     progress        the bar that a person sees
     result          what it leaves: Result, Row, SeedSummary
     selection       the policies that are kept along a run, and which of them is returned

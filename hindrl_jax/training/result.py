@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import numpy as np
@@ -109,7 +111,7 @@ class Result:
     cloned_success: np.ndarray | None = None
     """(S,) share of an evaluation's episodes that the policies cloned at the start solve, the most of three; None where there are none."""
     practised_success: np.ndarray | None = None
-    """(S,) the share that they solve in an evaluation after the latest round of practice; None where there was none."""
+    """(S,) the share that they solve in an evaluation after their latest round of practice, or before the first; None where none has practised."""
     practice_steps: np.ndarray | None = None
     """(S,) int, environment steps of that practice, which `env_steps` does not count; zeros where none are given."""
     returned: Returned | None = None
@@ -197,7 +199,16 @@ class Result:
             seconds_to_95=None if first is None else first.seconds,
             episode_length=float(self.final_length[index]),
             cloned_success=None if self.cloned_success is None else float(self.cloned_success[index]),
-            practised_success=None if self.practised_success is None else float(self.practised_success[index]),
+            practised_success=None if self.practised_success is None or not self.practice_steps[index] else float(self.practised_success[index]),
             practice_steps=int(self.practice_steps[index]),
             evaluation_steps=int(self.evaluation_steps[index]),
         )
+
+
+Report = Callable[[Result], Any]
+"""What `fit` calls along a run, see there."""
+
+
+def asks_to_end(answer: Any) -> bool:
+    """Whether that is what a report has returned: not a tuple, say, of what several reporters return together."""
+    return isinstance(answer, bool | np.bool_) and bool(answer)

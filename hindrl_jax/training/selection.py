@@ -92,7 +92,7 @@ def better(mean: Evaluation, sampled: Evaluation) -> tuple[np.ndarray, Evaluatio
     return is_better.astype(float), chosen
 
 
-def keep(kept: Kept, trial: Trial, confirmed: np.ndarray, moment: Moment) -> Kept:
+def keep(kept: Kept, trial: Trial, confirmed: np.ndarray, moment: Moment, *, among: np.ndarray | bool = True) -> Kept:
     """Keeps each run's policy in place of the worst one kept, if it is as good or confirmed. Runs that have one confirmed are over.
 
     Args:
@@ -100,12 +100,13 @@ def keep(kept: Kept, trial: Trial, confirmed: np.ndarray, moment: Moment) -> Kep
       trial: of the present policies.
       confirmed: (S,) bool, whose policy ends its run.
       moment: when.
+      among: (S,) bool, whose policy may be kept.
     """
     runs, success, length = np.arange(len(confirmed)), trial.evaluation.success.mean(axis=1), trial.evaluation.length.mean(axis=1)
     worst = np.lexsort((-kept.length, kept.success), axis=1)[:, 0]
     than = kept.success[runs, worst], kept.length[runs, worst]
     as_good = (success > than[0]) | ((success == than[0]) & (length <= than[1]))
-    taken = (kept.confirmed < 0) & (as_good | confirmed)
+    taken = among & (kept.confirmed < 0) & (as_good | confirmed)
     where = runs[taken], worst[taken]
 
     def replaced(before: np.ndarray, values: Any) -> np.ndarray:

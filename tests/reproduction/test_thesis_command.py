@@ -14,7 +14,7 @@ from hindrl_jax.cli import reproduction
 from hindrl_jax.reproduction import cells, scales, thesis
 from hindrl_jax.reproduction.cells import Task
 from hindrl_jax.reproduction.scales import Scale
-from hindrl_jax.training.experiment import Diverged
+from hindrl_jax.training.evaluating import Diverged
 
 SMALL = Task("FixedGridPickAndPlace", (("num_objects", 1), ("size", 4), ("random_box_size", 1), ("horizon", 20)), 1)
 NETWORK = (("agent.net_arch", (4,)), ("eval_every", 20), ("eval_episodes", 100))

@@ -19,7 +19,8 @@ import hindrl_jax as hindrl
 from hindrl_jax.runs.checkpoints import Checkpoints
 from hindrl_jax.runs.spec import RunSpec
 from hindrl_jax.runs.writer import RunWriter
-from hindrl_jax.training import devices, experiment
+from hindrl_jax.training import devices
+from hindrl_jax.training.evaluating import Diverged
 
 # Evaluated after every second chunk, with the programs of `tiny`.
 CONFIG = dataclasses.replace(tiny.CONFIG, eval_every=4)
@@ -236,7 +237,7 @@ def test_demonstrations_are_kept_next_to_the_checkpoints(tmp_path, demonstration
 
 def test_a_loss_that_is_not_finite_stops_the_run(demonstrations):
     hopeless = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, learning_rate=1e38))
-    with pytest.raises(experiment.Diverged, match=r"of seed 3 is (nan|inf) after \d+ environment steps and \d+ updates: try a lower learning_rate"):
+    with pytest.raises(Diverged, match=r"of seed 3 is (nan|inf) after \d+ environment steps and \d+ updates: try a lower learning_rate"):
         fit(demonstrations, hopeless)
 
 

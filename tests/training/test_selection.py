@@ -14,7 +14,8 @@ import hindrl_jax as hindrl
 from hindrl_jax.core.imitation import NOISES, NUM_STARTS, Attempts
 from hindrl_jax.core.rollout import Evaluation
 from hindrl_jax.runs.checkpoints import Checkpoints
-from hindrl_jax.training.experiment import Diverged, _worth
+from hindrl_jax.training.evaluating import Diverged
+from hindrl_jax.training.imitating import _best_of, _worth
 from hindrl_jax.training.selection import CHOICE_ROUNDS, NUM_KEPT, Moment, Trial, better, choose, keep, nothing_kept
 
 NOBODY = np.zeros(1, bool)
@@ -317,6 +318,13 @@ def test_the_steps_of_practice_are_those_after_which_a_run_was_solved():
     assert [row.env_steps for row in result.rows] == result.practice_steps.tolist()
 
 
+def test_what_practises_is_the_best_of_the_first_clones():
+    """Of equals the later one, which imitated for longer."""
+    clones = [policies(part, part + 0.5, part) for part in (1, 2, 3)]
+    best = _best_of(clones, [np.array([0.9, 0.5, 0.0]), np.array([0.9, 0.2, 0.4]), np.array([0.1, 0.5, 0.2])])
+    assert best["name"].tolist() == [2.0, 3.5, 2.0]
+
+
 def test_what_attempts_are_worth():
     attempts = Attempts(solved=np.array([[[True, False], [True, True]]]), length=np.full((1, 2, 2), 5), delay=np.array([[[0, 3], [1, 2]]]))
     configs = [dataclasses.replace(CONFIG, batch=dataclasses.replace(CONFIG.batch, gamma=0.5))]
@@ -333,6 +341,22 @@ def test_practice_ends_where_it_is_of_no_use_and_where_a_report_says_so():
     ended = fit(config, easily_imitated(), report=lambda result: result.cloned_success is not None)
     assert (ended.env_steps, ended.practised_success) == (0, None)
     assert (ended.returned.success == 1.0).all()
+
+
+def test_each_clone_practises_for_as_long_as_that_is_of_use_to_it():
+    """The first seed's clone stands still and does not begin; the other practises as it does beside one like itself."""
+    walking = easily_imitated()
+    standing = walking.replace(actions=jnp.full_like(walking.actions, -1.0))
+    config = dataclasses.replace(CLONING, stop_at=None, practice_rounds=3, steps=80)
+    mixed, alike = (fit(config, [first, walking]) for first in (standing, walking))
+    assert mixed.cloned_success.tolist() == mixed.practised_success.tolist() == [0.0, 1.0]
+    assert mixed.practice_steps[0] == 0
+    assert mixed.practice_steps[1] == alike.practice_steps[1] > 0
+    summary = mixed.summaries()[0]
+    assert (summary.practised_success, summary.practice_steps) == (None, 0)
+    clones_kept = (mixed.kept.actor["imitates"][0] == 1) & (mixed.kept.success[0] >= 0.0)
+    assert mixed.kept.env_steps[0][clones_kept].max(initial=0) == 0
+    assert mixed.kept.success[1].tolist() == alike.kept.success[1].tolist()
 
 
 def test_a_clone_that_is_not_finite_ends_the_run():
