@@ -134,7 +134,7 @@ def run(
                 what = f"a decision is {num_held} actions" if result.config.action_chunks else f"each action is held for {num_held} steps"
                 progress.say(f"{what}, so a demonstration of {steps} steps takes {-(-steps // num_held)} decisions")
             if resumes:
-                progress.say(f"going on at step {result.steps_done:,}" if result.steps_done else "there is no checkpoint yet: beginning again")
+                progress.say(_where_it_goes_on(result))
             stop_signals.note()
 
         def report(result: Result) -> None:
@@ -163,6 +163,12 @@ def run(
             if checkpoints is None or checkpoints.steps is None:
                 raise
             raise UserError(f"{error}; the last good checkpoint, of step {checkpoints.steps}, is in {checkpoints.folder}") from error
+
+
+def _where_it_goes_on(result: Result) -> str:
+    if result.practising is not None:
+        return f"going on after {counted(result.practising.rounds, 'round')} of practice"
+    return f"going on at step {result.steps_done:,}" if result.steps_done else "there is no checkpoint yet: beginning again"
 
 
 def speed_line(summary: dict[str, Any]) -> str:

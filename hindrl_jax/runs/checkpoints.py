@@ -1,6 +1,7 @@
 """Checkpoints: all that an experiment needs to go on, bit for bit, after it was stopped or killed.
 
-A checkpoint is a folder `STEPS` that Orbax writes under another name and renames when it is complete, so that half a checkpoint is never read:
+A checkpoint is a folder `STEPS`, or `practice-ROUNDS` of clones that practise before there are steps. Orbax writes it under another name and renames
+it when it is complete, so that half a checkpoint is never read:
 
 arrays      parameters, optimisers, replay, environment states and keys of all seeds, each array under its path in the tree
 progress    JSON: the evaluations so far, counters and times
@@ -31,7 +32,7 @@ import numpy as np
 from hindrl_jax.base.errors import UserError, one_line
 from hindrl_jax.base.files import DAMAGED_ARCHIVE, read_arrays, write_atomically
 from hindrl_jax.base.types import Episodes
-from hindrl_jax.training.result import Result, Row
+from hindrl_jax.training.result import Practising, Result, Row
 
 LAYOUT = 3
 DEMONSTRATIONS = "demonstrations.npz"
@@ -39,6 +40,7 @@ _ARRAYS = ("guidance", "state", "key", "kept")
 _COUNTERS = ("env_steps", "updates", "train_seconds")
 _OF_RUNS = ("cloned_success", "practised_success", "practice_steps")
 """What a result has of each run, if it has it."""
+_NAME = re.compile(r"(practice-)?[0-9]+")
 
 
 class Checkpoints:
@@ -59,6 +61,7 @@ class Checkpoints:
         """
         self.folder, self.seconds = Path(folder).absolute(), seconds
         self.steps: int | None = None  # of the newest checkpoint that was written or read here
+        self._name: str | None = None  # of its folder
         self._saved_at = time.monotonic()
 
     def save_when_due(self, result: Result) -> None:
@@ -72,7 +75,8 @@ class Checkpoints:
         Raises:
           UserError: if the disk refuses; the checkpoint before is still there.
         """
-        if not result.steps_done or result.steps_done == self.steps or result.final_success is not None:
+        name = _name_of(result)
+        if name in (None, self._name) or result.final_success is not None:
             return
         if not all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(result.state.agent) if jnp.issubdtype(leaf.dtype, jnp.floating)):
             return  # the next chunk's metrics will say so, and the checkpoint before is worth more
@@ -85,9 +89,10 @@ class Checkpoints:
             "evaluation_steps": [] if result.evaluation_steps is None else result.evaluation_steps.tolist(),
             **{name: None if (values := getattr(result, name)) is None else values.tolist() for name in _OF_RUNS},
             "imitation_seconds": result.imitation_seconds,
+            "practising": None if result.practising is None else {name: _as_json(value) for name, value in vars(result.practising).items()},
             **{name: getattr(result, name) for name in _COUNTERS},
         }
-        path = self.folder / str(result.steps_done)
+        path = self.folder / name
         with self._disk_trouble():
             # The keeper of checkpoints would wait for other hosts and threads; one file after the other is all that is needed here.
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -95,7 +100,7 @@ class Checkpoints:
                 items = {"arrays": ocp.args.StandardSave(arrays), "progress": ocp.args.JsonSave(progress)}
                 checkpointer.save(named, args=ocp.args.Composite(**items), force=True)
             self._remove_folders(but=path)
-        self.steps, self._saved_at = result.steps_done, time.monotonic()
+        self.steps, self._name, self._saved_at = result.steps_done, name, time.monotonic()
 
     def restore(self, begun: Result) -> Result | None:
         """For `fit`'s `restore`: the newest checkpoint, on the devices on which the experiment will go on; None if there is none.
@@ -133,9 +138,10 @@ class Checkpoints:
                 rows=[Row(**row) for row in progress["rows"]],
                 chunks=[{name: np.asarray(values, np.float32) for name, values in chunk.items()} for chunk in progress["chunks"]],
                 imitation_seconds=progress.get("imitation_seconds", 0.0),
+                practising=_practising(progress.get("practising")),
                 **{name: progress[name] for name in _COUNTERS},
             )
-        self.steps, self._saved_at = restored.steps_done, time.monotonic()
+        self.steps, self._name, self._saved_at = restored.steps_done, path.name, time.monotonic()
         return restored
 
     def remove(self) -> None:
@@ -184,7 +190,7 @@ class Checkpoints:
     def _complete(self) -> list[Path]:
         """The folders of complete checkpoints, the newest last."""
         found = self.folder.iterdir() if self.folder.is_dir() else ()
-        return sorted((path for path in found if path.name.isdecimal() and path.is_dir()), key=lambda path: int(path.name))
+        return sorted((path for path in found if _NAME.fullmatch(path.name) and path.is_dir()), key=_order)
 
     @contextlib.contextmanager
     def _disk_trouble(self) -> Iterator[None]:
@@ -192,7 +198,7 @@ class Checkpoints:
             yield
         except (OSError, ValueError) as error:  # the library beneath Orbax says ValueError of a full disk
             complete = self._complete()
-            before = f"; the checkpoint of step {complete[-1].name} is intact" if complete else ""
+            before = f"; the checkpoint {_when(complete[-1])} is intact" if complete else ""
             self._remove_folders(but=complete[-1] if complete else None)
             raise UserError(f"cannot write a checkpoint to {self.folder} ({one_line(error)}): free some space{before}") from error
 
@@ -221,6 +227,33 @@ def _plainly_named(path: Path) -> Iterator[Path]:
         link = Path(place) / "folder"
         link.symlink_to(path.parent, target_is_directory=True)
         yield link / path.name
+
+
+def _name_of(result: Result) -> str | None:
+    """The folder of its checkpoint; None where there is nothing to lose yet."""
+    if result.steps_done:
+        return str(result.steps_done)
+    return f"practice-{result.practising.rounds}" if result.practising is not None and result.practising.rounds else None
+
+
+def _order(path: Path) -> tuple[bool, int]:
+    """Practice comes before learning."""
+    return path.name.isdecimal(), int(path.name.rpartition("-")[2])
+
+
+def _when(path: Path) -> str:
+    return f"of step {path.name}" if path.name.isdecimal() else f"after {path.name.rpartition('-')[2]} rounds of practice"
+
+
+def _as_json(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+def _practising(saved: dict[str, Any] | None) -> Practising | None:
+    if saved is None:
+        return None
+    values: dict[str, Any] = {name: np.asarray(value) if isinstance(value, list) else value for name, value in saved.items()}
+    return Practising(**values)
 
 
 def _remove_folder(path: Path, *, patience: float = 5.0) -> None:

@@ -12,12 +12,12 @@ import numpy as np
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.core.agent import Params, policy
 from hindrl_jax.core.holding import in_control_steps
-from hindrl_jax.core.imitation import Attempts
+from hindrl_jax.core.imitation import Attempts, Practice
+from hindrl_jax.core.rollout import Evaluation
 from hindrl_jax.training.devices import gather, spread
 from hindrl_jax.training.evaluating import Diverged, as_rows, keep_good, played
 from hindrl_jax.training.programs import Programs
-from hindrl_jax.training.result import Report, Result, asks_to_end
-from hindrl_jax.training.selection import better
+from hindrl_jax.training.result import Practising, Report, Result, asks_to_end
 
 PRACTISABLE = 0.2
 """A clone practises if it solves at least this share of an evaluation's episodes: what is hardly ever solved is learnt sooner by reinforcement."""
@@ -28,54 +28,78 @@ RISING, PATIENCE = 1.02, 2
 def imitate(result: Result, programs: Programs, report: Report, started: float) -> bool:
     """Clones the demonstrations, then lets the best clone of each run practise for as long as that is of use to it.
 
-    What comes of it are the first policies that are kept.
+    What comes of it are the first policies that are kept. After each round `result` and `result.practising` are all that it takes to go on.
 
     Returns:
       Whether the experiment is to end.
     """
-    config, practice = result.config, programs.no_practice()
-    practises, score, patience = np.ones(len(result.seeds), bool), np.zeros(len(result.seeds)), np.full(len(result.seeds), PATIENCE)
-    imitation = latest = best = None
-    for index in range(config.practice_rounds + 1):
-        result.state, clones = programs.imitate(result.state, result.guidance, practice)
-        _check_finite(result, clones[-1])
-        clones, successes = clones if index == 0 else clones[-1:], []
-        for clone in clones:
-            policies = policy(result.state.agent.replace(imitation=clone), config, average=True, imitates=True)
-            evaluation = played(result, programs, policies, config.eval_episodes)
-            successes.append(np.asarray(evaluation.success).mean(axis=1))
-            latest = _where(practises, evaluation, latest)
-            best = latest if best is None else better(best, latest)[1]
-            if index == 0:
-                latest = best
-                result.cloned_success = np.asarray(best.success).mean(axis=1)
-            else:
-                result.practised_success = np.asarray(latest.success).mean(axis=1)
-            result.train_seconds = result.imitation_seconds = time.perf_counter() - started
-            moment = result.moment._replace(env_steps=result.practice_steps)
-            keep_good(result, programs, policies, np.zeros(len(result.seeds)), evaluation, moment, among=practises)
-            if result.kept.all_confirmed:  # and so the run ends here
-                result.rows += as_rows(result, best, {}, result.practice_steps)
-                return True
-        imitation = _where(practises, _best_of(gather(clones), successes), imitation)  # of those that no longer practise it stays
-        result.state = result.state.replace(agent=result.state.agent.replace(imitation=spread(imitation, programs.mesh)))
-        if config.practice_rounds > 0 and asks_to_end(report(result)):
+    config = result.config
+    if result.practising is None:
+        everybody, nothing = np.ones(len(result.seeds), bool), np.zeros(len(result.seeds))
+        patience = np.full(len(result.seeds), PATIENCE)
+        result.practising = Practising(0, goes_on=everybody, score=nothing, patience=patience, success=-np.ones(len(result.seeds)), length=nothing)
+        _clone(result, programs, programs.no_practice(), started)
+        if result.kept.all_confirmed or (config.practice_rounds > 0 and asks_to_end(report(result))):
             return True
-        practises &= (result.kept.confirmed < 0) & (np.asarray(latest.success).mean(axis=1) >= PRACTISABLE)
-        if index == config.practice_rounds or not practises.any():
-            return False
-        practice, attempts = programs.practise(result.state, result.guidance, practice)
-        attempts = gather(attempts)
-        steps = np.asarray(in_control_steps(attempts, result.env, config.num_held).length).sum(axis=(1, 2), dtype=np.int64)
-        result.practice_steps = result.practice_steps + np.where(practises, steps, 0)
-        result.imitation_seconds = time.perf_counter() - started
-        worth = _worth(attempts, result.configs)
-        patience = np.where(worth > RISING * score, PATIENCE, patience - 1)
-        practises &= patience > 0
-        if not practises.any():
-            return False
-        score = np.maximum(score, worth)
+    while result.practising.rounds < config.practice_rounds:
+        practice = _practise(result, programs, started)
+        if practice is None:
+            break
+        _clone(result, programs, practice, started)
+        if result.kept.all_confirmed or asks_to_end(report(result)):
+            return True
+    result.practising = None
     return False
+
+
+def _clone(result: Result, programs: Programs, practice: Practice, started: float) -> None:
+    """Clones for those who practise, looks at the clones, the first time at all parts of the cloning, and goes on with the best."""
+    progress, is_first = result.practising, result.practising.rounds == 0
+    before = jax.tree.map(np.array, gather(result.state.agent.imitation))  # a copy, as the state is donated
+    result.state, clones = programs.imitate(result.state, result.guidance, practice)
+    _check_finite(result, clones[-1])
+    clones, successes = clones if is_first else clones[-1:], []
+    for clone in clones:
+        policies = policy(result.state.agent.replace(imitation=clone), result.config, average=True, imitates=True)
+        evaluation = played(result, programs, policies, result.config.eval_episodes)
+        success, length = (np.asarray(values).mean(axis=1) for values in (evaluation.success, evaluation.length))
+        successes.append(success)
+        is_better = progress.goes_on & (success > progress.success)
+        progress.success, progress.length = np.where(is_better, success, progress.success), np.where(is_better, length, progress.length)
+        if is_first:
+            result.cloned_success = progress.success
+        else:
+            latest = result.cloned_success if result.practised_success is None else result.practised_success
+            result.practised_success = np.where(progress.goes_on, success, latest)
+        result.train_seconds = result.imitation_seconds = time.perf_counter() - started
+        moment = result.moment._replace(env_steps=result.practice_steps)
+        keep_good(result, programs, policies, np.zeros(len(result.seeds)), evaluation, moment, among=progress.goes_on)
+        if result.kept.all_confirmed:  # and so the run ends here
+            best: dict[str, Any] = dict(success=progress.success[:, None], length=progress.length[:, None])
+            result.rows += as_rows(result, Evaluation(**best), {}, result.practice_steps)
+            return
+    imitation = _where(progress.goes_on, _best_of(gather(clones), successes), before)
+    result.state = result.state.replace(agent=result.state.agent.replace(imitation=spread(imitation, programs.mesh)))
+
+
+def _practise(result: Result, programs: Programs, started: float) -> Practice | None:
+    """A round of practice of those to whom it may be of use; None if there are none, or to whom it was of no use again."""
+    progress = result.practising
+    success = result.cloned_success if result.practised_success is None else result.practised_success
+    progress.goes_on = progress.goes_on & (result.kept.confirmed < 0) & (success >= PRACTISABLE)
+    if not progress.goes_on.any():
+        return None
+    practice, attempts = programs.practise(result.state, result.guidance, programs.no_practice(progress.rounds))
+    progress.rounds += 1
+    attempts = gather(attempts)
+    steps = np.asarray(in_control_steps(attempts, result.env, result.config.num_held).length).sum(axis=(1, 2), dtype=np.int64)
+    result.practice_steps = result.practice_steps + np.where(progress.goes_on, steps, 0)
+    result.imitation_seconds = time.perf_counter() - started
+    worth = _worth(attempts, result.configs)
+    progress.patience = np.where(worth > RISING * progress.score, PATIENCE, progress.patience - 1)
+    progress.score = np.maximum(progress.score, worth)
+    progress.goes_on = progress.goes_on & (progress.patience > 0)
+    return practice if progress.goes_on.any() else None
 
 
 def _best_of(clones: Sequence[Params], successes: Sequence[np.ndarray]) -> Params:
@@ -85,9 +109,7 @@ def _best_of(clones: Sequence[Params], successes: Sequence[np.ndarray]) -> Param
 
 
 def _where(chosen: np.ndarray, one: Any, other: Any) -> Any:
-    """Of each of S runs the one value where it is `chosen` (S,), else the other; numpy leaves (S, ...). No other is no choice."""
-    if other is None:
-        return one
+    """Of each of S runs the one value where it is `chosen` (S,), else the other; numpy leaves (S, ...)."""
     return jax.tree.map(lambda one, other: np.where(np.expand_dims(chosen, tuple(range(1, one.ndim))), one, other), one, other)
 
 

@@ -94,9 +94,9 @@ class Programs(abc.ABC):
     def practise(self, state: TrainState, guidance: Guidance, practice: Practice) -> tuple[Practice, Attempts]:
         """Lets that policy play, see `core.imitation.practise`."""
 
-    def no_practice(self) -> Practice:
-        """Before the first round."""
-        of_one_run = jax.device_get(imitation.no_practice(self.env))
+    def no_practice(self, num_rounds: int = 0) -> Practice:
+        """What is remembered before a round of practice, which is nothing, after some other rounds."""
+        of_one_run = jax.device_get(imitation.no_practice(self.env)).replace(num_rounds=np.int32(num_rounds))
         return spread(jax.tree.map(lambda leaf, shape: np.broadcast_to(leaf, shape.shape), of_one_run, self._practice), self.mesh)
 
     @abc.abstractmethod

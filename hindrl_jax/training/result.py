@@ -81,6 +81,24 @@ class SeedSummary:
 
 
 @dataclasses.dataclass
+class Practising:
+    """How far the clones of S runs have practised."""
+
+    rounds: int
+    """So far."""
+    goes_on: np.ndarray
+    """(S,) bool, whose clone still does."""
+    score: np.ndarray
+    """(S,) the largest mean worth of a round's attempts."""
+    patience: np.ndarray
+    """(S,) int, the rounds after which it ends if none is worth more."""
+    success: np.ndarray
+    """(S,) of the best evaluation of a clone."""
+    length: np.ndarray
+    """(S,) mean length of its episodes."""
+
+
+@dataclasses.dataclass
 class Result:
     """An experiment, finished or under way: S runs side by side."""
 
@@ -114,6 +132,8 @@ class Result:
     """(S,) the share that they solve in an evaluation after their latest round of practice, or before the first; None where none has practised."""
     practice_steps: np.ndarray | None = None
     """(S,) int, environment steps of that practice, which `env_steps` does not count; zeros where none are given."""
+    practising: Practising | None = None
+    """Where clones are practising: how far."""
     returned: Returned | None = None
     """The best policy of each run; None while the experiment is under way."""
     final_success: np.ndarray | None = None

@@ -343,12 +343,19 @@ def test_practice_ends_where_it_is_of_no_use_and_where_a_report_says_so():
     assert (ended.returned.success == 1.0).all()
 
 
-def test_each_clone_practises_for_as_long_as_that_is_of_use_to_it():
+PRACTISING = dataclasses.replace(CLONING, stop_at=None, practice_rounds=3, steps=80)
+
+
+@pytest.fixture(scope="module")
+def practised():
+    """A run whose clones practise, before it learns for a while."""
+    return fit(PRACTISING, easily_imitated())
+
+
+def test_each_clone_practises_for_as_long_as_that_is_of_use_to_it(practised):
     """The first seed's clone stands still and does not begin; the other practises as it does beside one like itself."""
-    walking = easily_imitated()
-    standing = walking.replace(actions=jnp.full_like(walking.actions, -1.0))
-    config = dataclasses.replace(CLONING, stop_at=None, practice_rounds=3, steps=80)
-    mixed, alike = (fit(config, [first, walking]) for first in (standing, walking))
+    walking, alike = easily_imitated(), practised
+    mixed = fit(PRACTISING, [walking.replace(actions=jnp.full_like(walking.actions, -1.0)), walking])
     assert mixed.cloned_success.tolist() == mixed.practised_success.tolist() == [0.0, 1.0]
     assert mixed.practice_steps[0] == 0
     assert mixed.practice_steps[1] == alike.practice_steps[1] > 0
@@ -357,6 +364,28 @@ def test_each_clone_practises_for_as_long_as_that_is_of_use_to_it():
     clones_kept = (mixed.kept.actor["imitates"][0] == 1) & (mixed.kept.success[0] >= 0.0)
     assert mixed.kept.env_steps[0][clones_kept].max(initial=0) == 0
     assert mixed.kept.success[1].tolist() == alike.kept.success[1].tolist()
+
+
+def test_practice_that_was_killed_goes_on_after_its_last_round(practised, tmp_path):
+    checkpoints = Checkpoints(tmp_path, seconds=0)
+
+    def report(result):
+        checkpoints.save_when_due(result)
+        if result.practising is not None and result.practising.rounds == 2:
+            raise Killed
+
+    with pytest.raises(Killed):
+        fit(PRACTISING, easily_imitated(), report=report)
+    assert [path.name for path in tmp_path.iterdir()] == ["practice-2"]
+    said = []
+    resumed = fit(PRACTISING, easily_imitated(), restore=Checkpoints(tmp_path).restore, report=lambda result: said.append(result.practice_steps))
+    assert (said[0] > 0).all()
+    for name in ("cloned_success", "practised_success", "practice_steps", "evaluation_steps", "final_success"):
+        np.testing.assert_array_equal(getattr(resumed, name), getattr(practised, name), err_msg=name)
+    for name in ("kept", "returned"):
+        found, expected = (getattr(result, name).replace(seconds=0.0) for result in (resumed, practised))
+        jax.tree.map(np.testing.assert_array_equal, found, expected)
+    jax.tree.map(np.testing.assert_array_equal, resumed.state.agent, practised.state.agent)
 
 
 def test_a_clone_that_is_not_finite_ends_the_run():
