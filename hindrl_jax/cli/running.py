@@ -165,9 +165,14 @@ def run(
             raise UserError(f"{error}; the last good checkpoint, of step {checkpoints.steps}, is in {checkpoints.folder}") from error
 
 
+def _rounds_of(result: Result) -> str | None:
+    """What a run has done that is still practising; None if it has not begun to, or learns."""
+    return None if result.practising is None or not result.practising.rounds else f"{counted(result.practising.rounds, 'round')} of practice"
+
+
 def _where_it_goes_on(result: Result) -> str:
-    if result.practising is not None:
-        return f"going on after {counted(result.practising.rounds, 'round')} of practice"
+    if rounds := _rounds_of(result):
+        return f"going on after {rounds}"
     return f"going on at step {result.steps_done:,}" if result.steps_done else "there is no checkpoint yet: beginning again"
 
 
@@ -189,7 +194,8 @@ def _stop(result: Result, number: int, writer: RunWriter | SweepWriter, checkpoi
     else:
         checkpoints.save(result)
         said = f"go on with `hindrl {'sweep' if isinstance(writer, SweepWriter) else 'train'} --resume {shlex.quote(str(writer.path))}`"
-    print(f"hindrl: stopped after {result.steps_done:,} of {result.config.num_steps:,} {result.steps_unit}; {said}", file=sys.stderr)
+    steps = f"{result.steps_done:,} of {result.config.num_steps:,} {result.steps_unit}"
+    print(f"hindrl: stopped after {_rounds_of(result) or steps}; {said}", file=sys.stderr)
     sys.exit(128 + number)
 
 
