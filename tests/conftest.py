@@ -23,7 +23,7 @@ QUICK = ["--xla_backend_optimization_level=0", "--xla_llvm_disable_expensive_pas
 # Without the emitters, programs compile in a third of the time and memory, and in one piece a seventh sooner than in many. Not every version of the
 # compiler knows these two flags, and it stops at one that it does not know.
 WHERE_KNOWN = ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
-PROGRAMS = ("core", "envs", "experts", "tasks", "training")  # folders of tests; what all others train or play are programs of these
+PROGRAMS = ("core", "envs", "experts", "runs", "tasks", "training")  # folders of tests; what all others train or play are programs of these
 LONGEST = [f"test_{name}.py" for name in ("notebooks", "docs", "devices", "options", "golden", "checkpoints", "solves_a_task")]
 ENOUGH = 1e9  # bytes of a test process
 KEPT = 14 * 24 * 3600  # seconds after which a compiled program that no test used is deleted

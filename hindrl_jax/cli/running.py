@@ -160,9 +160,9 @@ def run(
         try:
             return fit(spec.env, demonstrations * len(configs), **runs, report=report, **restore)
         except (Diverged, SimulationFailed) as error:
-            if checkpoints is None or checkpoints.steps is None:
+            if checkpoints is None or checkpoints.newest is None:
                 raise
-            raise UserError(f"{error}; the last good checkpoint, of step {checkpoints.steps}, is in {checkpoints.folder}") from error
+            raise UserError(f"{error}; the last good checkpoint, {checkpoints.newest}, is in {checkpoints.folder}") from error
 
 
 def _rounds_of(result: Result) -> str | None:

@@ -52,12 +52,12 @@ class TrainConfig:
     """Gradient steps of behaviour cloning at the start, rounded up to a multiple of 3, which make a second policy, with the network of bc. As it is
     after each third of them it may be returned; reinforcement learning begins and goes on without it. 0 for no such policy."""
     practice_rounds: int = 0
-    """Rounds of practice of that policy, at most: it plays, and is cloned again, by as many gradient steps, from the demonstrations and the fastest
-    of its episodes that solved the task, for as long as it gets better (expert iteration; Anthony et al., 2017). `steps` does not count the
-    environment steps that it takes. 0 for none."""
+    """Rounds of practice of that policy, at most: if it solves a fifth of its episodes it plays, and is cloned again, by as many gradient steps, from
+    the demonstrations and the fastest of its episodes that solved the task, until two rounds running were no better than those before (expert
+    iteration; Anthony et al., 2017). `steps` does not count the environment steps that it takes. 0 for none."""
     imitation_proposal: bool = False
-    """That policy proposes an action beside the actor's: whichever the target critics value more is taken, in episodes, evaluations and targets
-    (IBRL, Hu et al., 2024)."""
+    """That policy, as it is after its practice, proposes an action beside the actor's: whichever the target critics value more is taken, in episodes,
+    evaluations and targets (IBRL, Hu et al., 2024)."""
     buffer_size: int = 500_000
     """Transitions that the replay holds."""
     stop_at: float | None = None

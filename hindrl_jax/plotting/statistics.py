@@ -1,6 +1,6 @@
 """Estimates over seeds with bootstrap intervals (Agarwal et al., deep reinforcement learning at the edge of the statistical precipice, 2021).
 
-`scipy.stats` is imported where it is used: it takes a third of the start of every command.
+`scipy.stats` is imported where it is used: it would take a third of the start of every command.
 """
 
 from __future__ import annotations

@@ -60,8 +60,7 @@ class Checkpoints:
           seconds: time between two checkpoints, 0 for as often as there is something new.
         """
         self.folder, self.seconds = Path(folder).absolute(), seconds
-        self.steps: int | None = None  # of the newest checkpoint that was written or read here
-        self._name: str | None = None  # of its folder
+        self._newest: Path | None = None  # that was written or read here
         self._saved_at = time.monotonic()
 
     def save_when_due(self, result: Result) -> None:
@@ -70,13 +69,14 @@ class Checkpoints:
             self.save(result)
 
     def save(self, result: Result) -> None:
-        """Saves an experiment under way, then removes the checkpoint before. Of one that has not begun or is finished nothing is saved.
+        """Saves an experiment under way, then removes the checkpoint before. Of one that has neither learnt nor practised, or is finished, nothing is
+        saved.
 
         Raises:
           UserError: if the disk refuses; the checkpoint before is still there.
         """
         name = _name_of(result)
-        if name in (None, self._name) or result.final_success is not None:
+        if name is None or result.final_success is not None or (self._newest is not None and self._newest.name == name):
             return
         if not all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(result.state.agent) if jnp.issubdtype(leaf.dtype, jnp.floating)):
             return  # the next chunk's metrics will say so, and the checkpoint before is worth more
@@ -100,7 +100,7 @@ class Checkpoints:
                 items = {"arrays": ocp.args.StandardSave(arrays), "progress": ocp.args.JsonSave(progress)}
                 checkpointer.save(named, args=ocp.args.Composite(**items), force=True)
             self._remove_folders(but=path)
-        self.steps, self._name, self._saved_at = result.steps_done, name, time.monotonic()
+        self._newest, self._saved_at = path, time.monotonic()
 
     def restore(self, begun: Result) -> Result | None:
         """For `fit`'s `restore`: the newest checkpoint, on the devices on which the experiment will go on; None if there is none.
@@ -141,8 +141,13 @@ class Checkpoints:
                 practising=_practising(progress.get("practising")),
                 **{name: progress[name] for name in _COUNTERS},
             )
-        self.steps, self._name, self._saved_at = restored.steps_done, path.name, time.monotonic()
+        self._newest, self._saved_at = path, time.monotonic()
         return restored
+
+    @property
+    def newest(self) -> str | None:
+        """What the newest checkpoint that was written or read here is of, as in: of step 400. None if there is none."""
+        return None if self._newest is None else _when(self._newest)
 
     def remove(self) -> None:
         """Removes all of them."""
@@ -237,12 +242,14 @@ def _name_of(result: Result) -> str | None:
 
 
 def _order(path: Path) -> tuple[bool, int]:
-    """Practice comes before learning."""
+    """Whether a checkpoint is of learning, which comes after practice, and of which step or round."""
     return path.name.isdecimal(), int(path.name.rpartition("-")[2])
 
 
 def _when(path: Path) -> str:
-    return f"of step {path.name}" if path.name.isdecimal() else f"after {path.name.rpartition('-')[2]} rounds of practice"
+    """What it is of, as in: the checkpoint of step 400."""
+    has_learnt, number = _order(path)
+    return f"of step {number}" if has_learnt else f"after {number} round{'s' * (number > 1)} of practice"
 
 
 def _as_json(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Evaluations along a run: playing, keeping what is good, and in the end the choice of what is returned."""
+"""How a run is judged: evaluations along it, what is good enough to be kept, what ends it, and in the end the choice of what is returned."""
 
 from __future__ import annotations
 

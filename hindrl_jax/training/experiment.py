@@ -52,7 +52,7 @@ def fit(
       config: for example from `preset`; one for all seeds, or one per seed. They may differ in the fields of `config.SWEEPABLE`.
       seeds: non-negative integers. A seed gives the same run whatever the others are, up to floating-point rounding. But an `action_hold` of None is
         chosen by the demonstrations of all of them, with `stop_at` they all learn on until the last of them is done, and which episodes evaluations
-        play depends on how long the clones of the others practise.
+        play, and so what is seen of a policy, depends on how long the clones of the others practise.
       report: called after compilation, after each round of practice, several times between evaluations, after each evaluation, and at the end.
         Where it returns True while the experiment practises or learns, that ends: what was found so far is returned as usual. Where it has a method
         `wait`, as `ProgressBar` does, that is called with "compiling" before this begins, since it takes 10 s to minutes. None shows a `ProgressBar`
@@ -133,6 +133,7 @@ def _train(result: Result, programs: Programs, report: Report) -> None:
     config, begins = result.config, result.steps_done == 0
     started = time.perf_counter() - result.train_seconds
     ends = imitate(result, programs, report, started) if begins and config.imitation_steps > 0 else result.kept.all_confirmed
+    result.practising = None
     if begins and config.learns_from_rollouts and not ends:
         result.state = jax.block_until_ready(programs.collect(result.state, result.guidance))
         result.env_steps = programs.steps_at_random

@@ -104,6 +104,8 @@ class HostPrograms(Programs):
         return self._programs["start"](seeds, demonstrations, self._put(begun), self.values)
 
     def collect(self, state: TrainState, guidance: Guidance) -> TrainState:
+        if not self._begun:
+            state = self._with_new_episodes(state, guidance)
         for _ in range(self.warm_up):
             state, plan = self._planned(state, at_random=True)
             state = self._stepped(state, plan, guidance)

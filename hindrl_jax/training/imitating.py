@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -35,9 +36,7 @@ def imitate(result: Result, programs: Programs, report: Report, started: float) 
     """
     config = result.config
     if result.practising is None:
-        everybody, nothing = np.ones(len(result.seeds), bool), np.zeros(len(result.seeds))
-        patience = np.full(len(result.seeds), PATIENCE)
-        result.practising = Practising(0, goes_on=everybody, score=nothing, patience=patience, success=-np.ones(len(result.seeds)), length=nothing)
+        result.practising = _not_yet(len(result.seeds))
         _clone(result, programs, programs.no_practice(), started)
         if result.kept.all_confirmed or (config.practice_rounds > 0 and asks_to_end(report(result))):
             return True
@@ -48,58 +47,75 @@ def imitate(result: Result, programs: Programs, report: Report, started: float) 
         _clone(result, programs, practice, started)
         if result.kept.all_confirmed or asks_to_end(report(result)):
             return True
-    result.practising = None
     return False
 
 
+def _not_yet(num_runs: int) -> Practising:
+    """Before the first clone."""
+    nothing, everybody = np.zeros(num_runs), np.ones(num_runs, bool)
+    return Practising(rounds=0, goes_on=everybody, score=nothing, patience=np.full(num_runs, PATIENCE), success=nothing - 1.0, length=nothing)
+
+
 def _clone(result: Result, programs: Programs, practice: Practice, started: float) -> None:
-    """Clones for those who practise, looks at the clones, the first time at all parts of the cloning, and goes on with the best."""
-    progress, is_first = result.practising, result.practising.rounds == 0
+    """Clones demonstrations and practice, evaluates the clones of those runs that practise, and goes on with them.
+
+    The first time, when there are demonstrations alone, clones are evaluated after each part of the gradient steps, and the best one goes on.
+    """
     before = jax.tree.map(np.array, gather(result.state.agent.imitation))  # a copy, as the state is donated
     result.state, clones = programs.imitate(result.state, result.guidance, practice)
     _check_finite(result, clones[-1])
+    goes_on, is_first = result.practising.goes_on, result.practising.rounds == 0
     clones, successes = clones if is_first else clones[-1:], []
     for clone in clones:
         policies = policy(result.state.agent.replace(imitation=clone), result.config, average=True, imitates=True)
         evaluation = played(result, programs, policies, result.config.eval_episodes)
         success, length = (np.asarray(values).mean(axis=1) for values in (evaluation.success, evaluation.length))
         successes.append(success)
-        is_better = progress.goes_on & (success > progress.success)
-        progress.success, progress.length = np.where(is_better, success, progress.success), np.where(is_better, length, progress.length)
+        best = result.practising
+        is_better = goes_on & (success > best.success)
+        success_of_best, length_of_best = np.where(is_better, success, best.success), np.where(is_better, length, best.length)
+        result.practising = dataclasses.replace(best, success=success_of_best, length=length_of_best)
         if is_first:
-            result.cloned_success = progress.success
+            result.cloned_success = success_of_best
         else:
-            latest = result.cloned_success if result.practised_success is None else result.practised_success
-            result.practised_success = np.where(progress.goes_on, success, latest)
+            result.practised_success = np.where(goes_on, success, _latest_success(result))
         result.train_seconds = result.imitation_seconds = time.perf_counter() - started
         moment = result.moment._replace(env_steps=result.practice_steps)
-        keep_good(result, programs, policies, np.zeros(len(result.seeds)), evaluation, moment, among=progress.goes_on)
+        keep_good(result, programs, policies, np.zeros(len(result.seeds)), evaluation, moment, among=goes_on)
         if result.kept.all_confirmed:  # and so the run ends here
-            best: dict[str, Any] = dict(success=progress.success[:, None], length=progress.length[:, None])
-            result.rows += as_rows(result, Evaluation(**best), {}, result.practice_steps)
+            found: dict[str, Any] = dict(success=success_of_best[:, None], length=length_of_best[:, None])
+            result.rows += as_rows(result, Evaluation(**found), {}, result.practice_steps)
             return
-    imitation = _where(progress.goes_on, _best_of(gather(clones), successes), before)
+    imitation = _where(goes_on, _best_of(gather(clones), successes), before)
     result.state = result.state.replace(agent=result.state.agent.replace(imitation=spread(imitation, programs.mesh)))
 
 
 def _practise(result: Result, programs: Programs, started: float) -> Practice | None:
-    """A round of practice of those to whom it may be of use; None if there are none, or to whom it was of no use again."""
-    progress = result.practising
-    success = result.cloned_success if result.practised_success is None else result.practised_success
-    progress.goes_on = progress.goes_on & (result.kept.confirmed < 0) & (success >= PRACTISABLE)
-    if not progress.goes_on.any():
+    """A round of practice of those runs to which it may be of use; None where there are none, or where none is to practise on after it."""
+    practising = result.practising
+    goes_on = practising.goes_on & (result.kept.confirmed < 0) & (_latest_success(result) >= PRACTISABLE)
+    result.practising = practising = dataclasses.replace(practising, goes_on=goes_on)
+    if not goes_on.any():
         return None
-    practice, attempts = programs.practise(result.state, result.guidance, programs.no_practice(progress.rounds))
-    progress.rounds += 1
+    practice, attempts = programs.practise(result.state, result.guidance, programs.no_practice(practising.rounds))
     attempts = gather(attempts)
     steps = np.asarray(in_control_steps(attempts, result.env, result.config.num_held).length).sum(axis=(1, 2), dtype=np.int64)
-    result.practice_steps = result.practice_steps + np.where(progress.goes_on, steps, 0)
+    result.practice_steps = result.practice_steps + np.where(goes_on, steps, 0)
     result.imitation_seconds = time.perf_counter() - started
-    worth = _worth(attempts, result.configs)
-    progress.patience = np.where(worth > RISING * progress.score, PATIENCE, progress.patience - 1)
-    progress.score = np.maximum(progress.score, worth)
-    progress.goes_on = progress.goes_on & (progress.patience > 0)
-    return practice if progress.goes_on.any() else None
+    result.practising = _after_a_round(practising, _worth(attempts, result.configs))
+    return practice if result.practising.goes_on.any() else None
+
+
+def _latest_success(result: Result) -> np.ndarray:
+    """(S,) of the clones, in their latest evaluation; of the first ones the best."""
+    return result.cloned_success if result.practised_success is None else result.practised_success
+
+
+def _after_a_round(practising: Practising, worth: np.ndarray) -> Practising:
+    """What becomes of practice whose attempts were worth so much (S,) in a round, see `RISING`."""
+    patience = np.where(worth > RISING * practising.score, PATIENCE, practising.patience - 1)
+    goes_on, score = practising.goes_on & (patience > 0), np.maximum(practising.score, worth)
+    return dataclasses.replace(practising, rounds=practising.rounds + 1, goes_on=goes_on, score=score, patience=patience)
 
 
 def _best_of(clones: Sequence[Params], successes: Sequence[np.ndarray]) -> Params:

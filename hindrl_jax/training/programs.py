@@ -95,7 +95,7 @@ class Programs(abc.ABC):
         """Lets that policy play, see `core.imitation.practise`."""
 
     def no_practice(self, num_rounds: int = 0) -> Practice:
-        """What is remembered before a round of practice, which is nothing, after some other rounds."""
+        """What a round of practice begins with: no episodes, and the number of rounds so far, on which its random numbers depend."""
         of_one_run = jax.device_get(imitation.no_practice(self.env)).replace(num_rounds=np.int32(num_rounds))
         return spread(jax.tree.map(lambda leaf, shape: np.broadcast_to(leaf, shape.shape), of_one_run, self._practice), self.mesh)
 

@@ -72,20 +72,20 @@ class SeedSummary:
     """Share of an evaluation's episodes that the policy cloned at the start solves (`TrainConfig.imitation_steps`), the most of three; None where
     there is none. Where that one is returned, `returned_updates` is 0."""
     practised_success: float | None
-    """The share that it solves in an evaluation after the last round of practice (`TrainConfig.practice_rounds`); None where there was none. The
-    clone of an earlier round may be better, and the one that is returned."""
+    """The share that it solves in an evaluation after the last round of practice that was cloned (`TrainConfig.practice_rounds`); None where there
+    was none. The clone of an earlier round may be better, and the one that is returned."""
     practice_steps: int
-    """Environment steps of that practice; `env_steps` does not count them."""
+    """Environment steps of all its practice; `env_steps` does not count them."""
     evaluation_steps: int
     """Environment steps that evaluations and the choice of the returned policy took; `env_steps` does not count them."""
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(frozen=True)
 class Practising:
     """How far the clones of S runs have practised."""
 
     rounds: int
-    """So far."""
+    """Rounds so far."""
     goes_on: np.ndarray
     """(S,) bool, whose clone still does."""
     score: np.ndarray
@@ -129,7 +129,8 @@ class Result:
     cloned_success: np.ndarray | None = None
     """(S,) share of an evaluation's episodes that the policies cloned at the start solve, the most of three; None where there are none."""
     practised_success: np.ndarray | None = None
-    """(S,) the share that they solve in an evaluation after their latest round of practice, or before the first; None where none has practised."""
+    """(S,) the share that they solve in an evaluation after the latest round of practice that was cloned, and `cloned_success` of those that have not
+    practised; None where none has."""
     practice_steps: np.ndarray | None = None
     """(S,) int, environment steps of that practice, which `env_steps` does not count; zeros where none are given."""
     practising: Practising | None = None

@@ -181,9 +181,8 @@ def test_each_seed_plays_its_own_policy_towards_one_of_its_goals_per_episode(run
         @jax.jit
         def act_twice(key):
             key_reset, *keys_act = jax.random.split(key, 3)
-            with jax.debug_key_reuse(False):  # the episode's goal is drawn at every step, always with the key in the state
-                state, observation = env.reset(key_reset)
-                return jnp.stack([act(key_act, state, observation) for key_act in keys_act])
+            state, observation = env.reset(key_reset)
+            return jnp.stack([act(key_act, state, observation) for key_act in keys_act])
 
         def play_one(key):
             acted.append(np.asarray(act_twice(key)))

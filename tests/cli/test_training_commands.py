@@ -6,6 +6,7 @@ import json
 import shlex
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -15,6 +16,7 @@ from toy_env import Corridor, corridor_demonstrations
 
 import hindrl_jax as hindrl
 from hindrl_jax import cli
+from hindrl_jax.cli.running import _stop, _where_it_goes_on
 from hindrl_jax.cli.train_options import parse_train
 from hindrl_jax.cli.training import advice, said_of_clones, said_of_never
 from hindrl_jax.runs.reader import load_run
@@ -115,6 +117,24 @@ def test_a_clone_that_was_kept_is_called_one():
     practised = said_of_clones([learnt, clone | {"returned_env_steps": 900}])
     assert practised == ["what was kept of seed 4 is the clone of the demonstrations, and its steps are those of its practice"]
     assert "of seeds 4, 5 is" in said_of_clones([learnt, clone, clone | {"seed": 5}])[0]
+
+
+@pytest.mark.parametrize(
+    ("rounds", "steps", "stopped", "goes_on"),
+    [
+        (None, 0, "stopped after 0 of 80 steps; no checkpoint", "there is no checkpoint yet: beginning again"),
+        (0, 0, "stopped after 0 of 80 steps; no checkpoint", "there is no checkpoint yet: beginning again"),
+        (1, 0, "stopped after 1 round of practice; no checkpoint", "going on after 1 round of practice"),
+        (None, 40, "stopped after 40 of 80 steps; no checkpoint", "going on at step 40"),
+    ],
+)
+def test_a_run_says_where_it_was_stopped_and_goes_on(rounds, steps, stopped, goes_on, capsys):
+    practising = None if rounds is None else SimpleNamespace(rounds=rounds)
+    result = SimpleNamespace(practising=practising, steps_done=steps, steps_unit="steps", config=SimpleNamespace(num_steps=80))
+    assert _where_it_goes_on(result) == goes_on
+    with pytest.raises(SystemExit):
+        _stop(result, 2, None, None)
+    assert stopped in capsys.readouterr().err
 
 
 def test_never_is_explained_where_sampled_actions_solved_the_task():

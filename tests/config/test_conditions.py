@@ -34,13 +34,6 @@ SMALL = TrainConfig(
 )
 
 
-@pytest.fixture(scope="module", autouse=True)
-def keys_are_not_followed():
-    """That takes longer than tracing; other tests do it."""
-    with jax.debug_key_reuse(False):
-        yield
-
-
 class Tanh(nn.Module):
     """A network of one's own."""
 

@@ -21,6 +21,7 @@ from hindrl_jax.core.hindsight import NEARBY_GOAL
 from hindrl_jax.core.imitation import NOISES, NUM_STARTS
 from hindrl_jax.runs.checkpoints import Checkpoints
 from hindrl_jax.tasks.simulators import Simulators
+from hindrl_jax.training import imitating
 from hindrl_jax.training.host_playing import play, record, with_noise
 from hindrl_jax.training.judging import as_judged_by
 from hindrl_jax.training.recording import record_gymnasium
@@ -96,8 +97,9 @@ def test_recorded_episodes_are_what_the_environment_makes_of_their_actions(env):
 
 
 @pytest.mark.parametrize("success", ["reached", "held"])
-def test_a_clone_practises_where_environments_are_stepped_outside_jax(env, success):
+def test_a_clone_practises_where_environments_are_stepped_outside_jax(env, success, monkeypatch):
     """Seven environments for each run, so that the last starts of a round are fewer than these."""
+    monkeypatch.setattr(imitating, "PRACTISABLE", 0.0)  # both seeds
     judged = dataclasses.replace(env, success=success)
     config = dataclasses.replace(CONFIG, imitation_steps=90, practice_rounds=2, num_envs=7, steps=120)
     result = hindrl.fit(judged, record_gymnasium(judged, to_goal, 5, seed=1), config, seeds=[0, 1])
@@ -107,6 +109,28 @@ def test_a_clone_practises_where_environments_are_stepped_outside_jax(env, succe
     assert success == "reached" or (result.practice_steps % (10 * attempts) == 0).all()  # held to the horizon
     for name, value in (("practised_success", result.practised_success), ("practice_steps", result.practice_steps)):
         assert [getattr(summary, name) for summary in result.summaries()] == value.tolist()
+
+
+def test_practice_that_was_stopped_goes_on_where_environments_are_stepped_outside_jax(env, tmp_path, monkeypatch):
+    monkeypatch.setattr(imitating, "PRACTISABLE", 0.0)
+    demonstrations = record_gymnasium(env, to_goal, 5, seed=1)
+    config = dataclasses.replace(CONFIG, imitation_steps=90, practice_rounds=2, steps=60)
+    checkpoints, before = Checkpoints(tmp_path, seconds=0), []
+
+    def stop(result):
+        checkpoints.save_when_due(result)
+        if result.practising is not None and result.practising.rounds == 1:
+            before.append((result.cloned_success, result.practice_steps))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        hindrl.fit(env, demonstrations, config, report=stop)
+    assert checkpoints.newest == "after 1 round of practice"
+    resumed = hindrl.fit(env, demonstrations, config, restore=Checkpoints(tmp_path).restore)
+    (success, steps), *_ = before
+    assert resumed.cloned_success.tolist() == success.tolist()
+    assert resumed.practice_steps > steps  # of its second round
+    assert resumed.env_steps == 60
 
 
 @pytest.mark.parametrize("num_held", [1, 3])

@@ -15,7 +15,7 @@ from hindrl_jax.core.imitation import NOISES, NUM_STARTS, Attempts
 from hindrl_jax.core.rollout import Evaluation
 from hindrl_jax.runs.checkpoints import Checkpoints
 from hindrl_jax.training.evaluating import Diverged
-from hindrl_jax.training.imitating import _best_of, _worth
+from hindrl_jax.training.imitating import PATIENCE, _after_a_round, _best_of, _not_yet, _worth
 from hindrl_jax.training.selection import CHOICE_ROUNDS, NUM_KEPT, Moment, Trial, better, choose, keep, nothing_kept
 
 NOBODY = np.zeros(1, bool)
@@ -325,6 +325,26 @@ def test_what_practises_is_the_best_of_the_first_clones():
     assert best["name"].tolist() == [2.0, 3.5, 2.0]
 
 
+def test_practice_ends_for_each_seed_with_the_second_round_running_that_is_no_better():
+    """The first gets better at last, the second and third no more after the first round, 2% and less being no gain; nothing begins anew."""
+    practising = _not_yet(3)
+    assert PATIENCE == 2
+    for rounds, (worth, goes_on) in enumerate(
+        [
+            ([0.2, 0.50, 0.0], [True, True, True]),
+            ([0.1, 0.51, 0.0], [True, True, False]),
+            ([0.3, 0.50, 0.9], [True, False, False]),
+            ([0.2, 0.90, 0.9], [True, False, False]),
+            ([0.3, 0.90, 0.9], [False, False, False]),
+        ],
+        start=1,
+    ):
+        practising = _after_a_round(practising, np.array(worth))
+        assert practising.rounds == rounds
+        assert practising.goes_on.tolist() == goes_on
+    assert practising.score.tolist() == [0.3, 0.9, 0.9]
+
+
 def test_what_attempts_are_worth():
     attempts = Attempts(solved=np.array([[[True, False], [True, True]]]), length=np.full((1, 2, 2), 5), delay=np.array([[[0, 3], [1, 2]]]))
     configs = [dataclasses.replace(CONFIG, batch=dataclasses.replace(CONFIG.batch, gamma=0.5))]
@@ -378,6 +398,7 @@ def test_practice_that_was_killed_goes_on_after_its_last_round(practised, tmp_pa
         fit(PRACTISING, easily_imitated(), report=report)
     assert [path.name for path in tmp_path.iterdir()] == ["practice-2"]
     said = []
+    assert practised.practising is None
     resumed = fit(PRACTISING, easily_imitated(), restore=Checkpoints(tmp_path).restore, report=lambda result: said.append(result.practice_steps))
     assert (said[0] > 0).all()
     for name in ("cloned_success", "practised_success", "practice_steps", "evaluation_steps", "final_success"):
