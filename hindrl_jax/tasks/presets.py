@@ -18,7 +18,8 @@ called. What differs between tasks follows from what they are and from the demon
                            they have parameters of the task in their observations half of them, with goals of demonstrations and rollouts; where
                            all aim at the same, a fifth, with goals of demonstrations: there, other goals are not what is to be learnt, and take
                            rows of the batch
-    practice               where all episodes aim at the same; where each is another task, 32 episodes of practice say too little about the others
+    practice               where the environment is stepped in JAX, since it takes many steps, and all episodes aim at the same: where each is
+                           another task, its 32 episodes say too little about the others
     the goal as an input   what is left to it, desired less achieved, where episodes have goals of their own; else the goal
     target entropy         counts per action dimension
     random steps           one horizon in each environment
@@ -34,7 +35,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from hindrl_jax.base.environments import Environment, RelabelsObservations
+from hindrl_jax.base.environments import Environment, RelabelsObservations, can_step
 from hindrl_jax.base.errors import UserError
 from hindrl_jax.base.steppers import gives_goals
 from hindrl_jax.config import IMITATION_NET_ARCH, AgentConfig, Algorithm, BatchConfig, GoalConfig, QuirksConfig, TrainConfig
@@ -93,7 +94,7 @@ def _default(algo: Algorithm, env: Environment) -> TrainConfig:
     if algo == "bc":
         agent = AgentConfig(net_arch=IMITATION_NET_ARCH)
         return TrainConfig(algo="bc", steps=1_500, eval_every=250, batch=BatchConfig(n_step=1), goal=goal, agent=agent)
-    practice_rounds = 0 if gives_goals(env) or isinstance(env, RelabelsObservations) else _PRACTICE_ROUNDS
+    practice_rounds = _PRACTICE_ROUNDS if can_step(env) and not isinstance(env, RelabelsObservations) else 0
     return TrainConfig(imitation_steps=_IMITATION_STEPS, practice_rounds=practice_rounds, goal=goal, batch=_batch(env))
 
 
