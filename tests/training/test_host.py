@@ -96,13 +96,15 @@ def test_recorded_episodes_are_what_the_environment_makes_of_their_actions(env):
             assert not episodes.rewards[row, length:].any()
 
 
+PRACTISING = dataclasses.replace(CONFIG, imitation_steps=90, practice_rounds=2, num_envs=7, steps=120)
+
+
 @pytest.mark.parametrize("success", ["reached", "held"])
 def test_a_clone_practises_where_environments_are_stepped_outside_jax(env, success, monkeypatch):
     """Seven environments for each run, so that the last starts of a round are fewer than these."""
     monkeypatch.setattr(imitating, "PRACTISABLE", 0.0)  # both seeds
     judged = dataclasses.replace(env, success=success)
-    config = dataclasses.replace(CONFIG, imitation_steps=90, practice_rounds=2, num_envs=7, steps=120)
-    result = hindrl.fit(judged, record_gymnasium(judged, to_goal, 5, seed=1), config, seeds=[0, 1])
+    result = hindrl.fit(judged, record_gymnasium(judged, to_goal, 5, seed=1), PRACTISING, seeds=[0, 1])
     assert (result.practised_success >= 0.5).any()
     attempts = NUM_STARTS * len(NOISES)
     assert ((result.practice_steps >= attempts) & (result.practice_steps <= 2 * 10 * attempts)).all()
@@ -114,7 +116,6 @@ def test_a_clone_practises_where_environments_are_stepped_outside_jax(env, succe
 def test_practice_that_was_stopped_goes_on_where_environments_are_stepped_outside_jax(env, tmp_path, monkeypatch):
     monkeypatch.setattr(imitating, "PRACTISABLE", 0.0)
     demonstrations = record_gymnasium(env, to_goal, 5, seed=1)
-    config = dataclasses.replace(CONFIG, imitation_steps=90, practice_rounds=2, steps=60)
     checkpoints, before = Checkpoints(tmp_path, seconds=0), []
 
     def stop(result):
@@ -124,13 +125,13 @@ def test_practice_that_was_stopped_goes_on_where_environments_are_stepped_outsid
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        hindrl.fit(env, demonstrations, config, report=stop)
+        hindrl.fit(env, demonstrations, PRACTISING, seeds=[0, 1], report=stop)
     assert checkpoints.newest == "after 1 round of practice"
-    resumed = hindrl.fit(env, demonstrations, config, restore=Checkpoints(tmp_path).restore)
+    resumed = hindrl.fit(env, demonstrations, PRACTISING, seeds=[0, 1], restore=Checkpoints(tmp_path).restore)
     (success, steps), *_ = before
     assert resumed.cloned_success.tolist() == success.tolist()
-    assert resumed.practice_steps > steps  # of its second round
-    assert resumed.env_steps == 60
+    assert (resumed.practice_steps > steps).all()  # of the second round
+    assert resumed.env_steps >= 120
 
 
 @pytest.mark.parametrize("num_held", [1, 3])
