@@ -8,8 +8,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from hindrl_jax.base.types import tree_where
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.core.agent import Params, policy
 from hindrl_jax.core.holding import in_control_steps
@@ -86,7 +88,7 @@ def _clone(result: Result, programs: Programs, practice: Practice, started: floa
             found: dict[str, Any] = dict(success=success_of_best[:, None], length=length_of_best[:, None])
             result.rows += as_rows(result, Evaluation(**found), {}, result.practice_steps)
             return
-    imitation = _where(goes_on, _best_of(gather(clones), successes), before)
+    imitation = jax.device_get(tree_where(jnp.asarray(goes_on), _best_of(gather(clones), successes), before))
     result.state = result.state.replace(agent=result.state.agent.replace(imitation=spread(imitation, programs.mesh)))
 
 
@@ -122,11 +124,6 @@ def _best_of(clones: Sequence[Params], successes: Sequence[np.ndarray]) -> Param
     """Each run's clone, numpy leaves (S, ...), that has the most success (S,), and of equals the later one."""
     best = len(clones) - 1 - np.argmax(successes[::-1], axis=0)
     return jax.tree.map(lambda *leaves: np.stack(leaves)[best, np.arange(len(best))], *clones)
-
-
-def _where(chosen: np.ndarray, one: Any, other: Any) -> Any:
-    """Of each of S runs the one value where it is `chosen` (S,), else the other; numpy leaves (S, ...)."""
-    return jax.tree.map(lambda one, other: np.where(np.expand_dims(chosen, tuple(range(1, one.ndim))), one, other), one, other)
 
 
 def _worth(attempts: Attempts, configs: Sequence[TrainConfig]) -> np.ndarray:
