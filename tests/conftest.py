@@ -16,6 +16,7 @@ import jax
 import jaxlib
 import psutil
 import pytest
+import shared_programs
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
@@ -23,7 +24,7 @@ QUICK = ["--xla_backend_optimization_level=0", "--xla_llvm_disable_expensive_pas
 # Without the emitters, programs compile in a third of the time and memory, and in one piece a seventh sooner than in many. Not every version of the
 # compiler knows these two flags, and it stops at one that it does not know.
 WHERE_KNOWN = ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
-PROGRAMS = ("core", "envs", "experts", "runs", "tasks", "training")  # folders of tests; what all others train or play are programs of these
+FUNCTIONS = ("core", "envs", "experts")  # folders of tests that call single functions; whole programs are looked at in tests/config
 LONGEST = [f"test_{name}.py" for name in ("notebooks", "docs", "devices", "options", "golden", "checkpoints", "solves_a_task")]
 ENOUGH = 1e9  # bytes of a test process
 KEPT = 14 * 24 * 3600  # seconds after which a compiled program that no test used is deleted
@@ -64,15 +65,18 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_collection_finish():
-    """Python looks for garbage less often, and not among modules and tests, which stay: tracing makes many objects and hardly any cycles."""
+    """Equal programs are compiled once. Python looks for garbage less often, and not among modules and tests, which stay: tracing makes many objects
+    and hardly any cycles.
+    """
+    shared_programs.install()
     gc.freeze()
     gc.set_threshold(20_000, 50, 100)
 
 
 @pytest.fixture(scope="module", autouse=True)
 def random_keys_are_consumed_once(request):
-    """Takes a fifth of the time of a test that traces programs."""
-    jax.config.update("jax_debug_key_reuse", request.path.parent.name in PROGRAMS)
+    """Takes a quarter of the time of a test that trains, as each call of a compiled program is slow then."""
+    jax.config.update("jax_debug_key_reuse", request.path.parent.name in FUNCTIONS)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -82,6 +86,7 @@ def memory_is_given_back():
     """
     yield
     if psutil.Process().memory_info().rss > ENOUGH:
+        shared_programs.forget()
         jax.clear_caches()
         gc.collect()
     with contextlib.suppress(AttributeError):  # other C libraries have no such function

@@ -7,6 +7,7 @@ import re
 import jax
 import numpy as np
 from flax.errors import FlaxError
+from jax.experimental.key_reuse._core import check_key_reuse_jaxpr
 from jax.interpreters import partial_eval
 from toy_env import Corridor, corridor_demonstrations
 
@@ -78,10 +79,15 @@ class Stages:
 
 
 class Traced:
-    """A function of swept values and others, traced; `text` is what leads to its used outputs, which are named by their paths."""
+    """A function of swept values and others, traced; `text` is what leads to its used outputs, which are named by their paths.
+
+    Raises:
+      KeyReuseError: if it consumes a random key twice.
+    """
 
     def __init__(self, function, values, arguments, used_outputs=None):
         closed, self.shapes = jax.make_jaxpr(function, return_shape=True)(values, *arguments)
+        check_key_reuse_jaxpr(closed.jaxpr)
         outputs = paths(self.shapes)
         self.closed, self.inputs = closed, [*values, *paths(arguments)]
         self.keep(set(outputs) if used_outputs is None else used_outputs, outputs)

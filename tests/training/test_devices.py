@@ -61,6 +61,7 @@ def hindrl(*arguments):
     return subprocess.Popen(command, env=with_devices(1), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
+@pytest.mark.slow
 def test_two_processes_give_what_one_gives(tmp_path):
     """The one is this process: its programs are those of other tests, while the two begin without any."""
     with socket.socket() as probe:
