@@ -58,6 +58,9 @@ class TrainConfig:
     imitation_proposal: bool = False
     """That policy, as it is after its practice, proposes an action beside the actor's: whichever the target critics value more is taken, in episodes,
     evaluations and targets (IBRL, Hu et al., 2024)."""
+    network_resets: bool = False
+    """An agent that is stuck, since none of its evaluations was better for a fifth of the run, and for as long as it had taken to come there, begins
+    anew, with all that is in the replay (Nikishin et al., the primacy bias in deep reinforcement learning, 2022)."""
     buffer_size: int = 500_000
     """Transitions that the replay holds."""
     stop_at: float | None = None
@@ -102,6 +105,7 @@ class TrainConfig:
                 "imitation_steps": self.imitation_steps,
                 "practice_rounds": self.practice_rounds,
                 "imitation_proposal": self.imitation_proposal,
+                "network_resets": self.network_resets,
                 "q_filter": self.agent.q_filter != "off" and self.agent.q_filter,
                 "base": self.agent.base != "tqc" and self.agent.base,
             }

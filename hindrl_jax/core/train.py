@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from hindrl_jax.base.environments import Environment, Steppable
-from hindrl_jax.base.types import Array, TimeStep, Transition
+from hindrl_jax.base.types import Array, TimeStep, Transition, tree_where
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.core import agent as agents
 from hindrl_jax.core import curriculum, replay, rollout
@@ -29,6 +29,8 @@ from hindrl_jax.core.replay import RecordedStep, ReplayState
 from hindrl_jax.core.rollout import Act, DemoResets, Evaluation, RolloutState
 from hindrl_jax.core.schedules import schedule
 
+_RESET = 2**18  # the random numbers of fresh agents are none of those that a state's key gives when it is split
+
 
 class TrainState(struct.PyTreeNode, kw_only=True):
     """All that a run needs to go on."""
@@ -39,7 +41,7 @@ class TrainState(struct.PyTreeNode, kw_only=True):
     curriculum: Curriculum | None = None  # how far back in the demonstrations episodes begin; None without `demo_reset_curriculum`
     key: Array
     env_steps: Array  # () int32
-    updates: Array  # () int32
+    updates: Array  # () int32, of the present agent
 
 
 def init(key: Array, guidance: Guidance, env: Environment, config: TrainConfig, *, begun: RolloutState | None = None) -> TrainState:
@@ -152,6 +154,20 @@ def collect(state: TrainState, guidance: Guidance, *, env: Steppable, config: Tr
         return _interact(key_interact, state.replace(key=key), guidance, env, config, act_at_random(env)), None
 
     return jax.lax.scan(iteration, state, length=num_iterations)[0]
+
+
+def reset_networks(state: TrainState, is_stuck: Array, *, env: Environment, config: TrainConfig) -> TrainState:
+    """A fresh agent in the place of one that is stuck, which learns from what the replay holds (Nikishin et al., the primacy bias in deep
+    reinforcement learning, 2022). The policy that imitates, if there is one, stays.
+
+    Args:
+      state: a run.
+      is_stuck: () bool; where it is False the state stays as it is.
+      env, config: static.
+    """
+    key, agent = jax.random.fold_in(state.key, _RESET), state.agent
+    fresh = agents.init(key, agent.scale, config, action_dim=env.action_dim).replace(imitation=agent.imitation)
+    return state.replace(agent=tree_where(is_stuck, fresh, agent), updates=jnp.where(is_stuck, 0, state.updates))
 
 
 def learn(state: TrainState, guidance: Guidance, *, env: Steppable, config: TrainConfig, num_iterations: int) -> tuple[TrainState, Metrics]:

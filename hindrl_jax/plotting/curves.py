@@ -28,6 +28,7 @@ def save_curve(result: Result, path: Path) -> None:
         if len(sampled) == len(result.rows):
             by_seed = 100 * np.reshape(sampled, success.shape)
             axes[0].plot(x, by_seed.mean(axis=1), color=MEAN, linewidth=1, linestyle=":", label="with sampled actions")
+        _mark_resets(axes[0], result)
         _mark_returned(axes[0], result)
         lengths = np.asarray(result.guidance.demonstrations.lengths) * result.config.num_held
         axes[1].axhline(lengths.mean(), color=DEMONSTRATION, linestyle="--", linewidth=1, label="demonstrations")
@@ -95,6 +96,14 @@ def _mark_returned(axis: Any, result: Result) -> None:
     if result.returned is not None:
         steps = result.returned.env_steps if result.config.learns_from_rollouts else result.returned.updates
         axis.scatter(steps, 100 * result.returned.success, s=18, color=RETURNED, marker="o", zorder=5, label="returned")
+
+
+def _mark_resets(axis: Any, result: Result) -> None:
+    """Where networks were reset, on the curves of their runs."""
+    at = {(seed, steps) for seed, of_run in zip(result.seeds, result.resets, strict=True) for steps in of_run}
+    points = [(row.env_steps, 100 * row.success) for row in result.rows if (row.seed, row.env_steps) in at]
+    if points:
+        axis.scatter(*zip(*points, strict=True), s=18, color=MEAN, marker="v", zorder=4, label="networks reset")
 
 
 def _x_label(result: Result) -> str:

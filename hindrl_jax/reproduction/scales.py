@@ -130,8 +130,10 @@ def _config(setting: Setting, recipe: Recipe, scale: ScaleName) -> TrainConfig:
     if setting.algo == "bc":
         return changed(config, of_scale.cloning)
     weight: Changes = () if setting.bc_weight is None else (("agent.bc_weight", setting.bc_weight),)
-    # The thesis compares methods: what reinforcement learning finds, not the clone that a run of ours would return where that is better.
-    return changed(config, (*(of_scale.ours if recipe == "default" else of_scale.theirs), *weight, ("imitation_steps", 0), ("practice_rounds", 0)))
+    # The thesis compares methods: what one agent learns by reinforcement, not a clone that a run of ours returns where that is better, nor what a
+    # second agent makes of the replay of one that is stuck.
+    ours = of_scale.ours if recipe == "default" else of_scale.theirs
+    return changed(config, (*ours, *weight, ("imitation_steps", 0), ("practice_rounds", 0), ("network_resets", False)))
 
 
 SHARE_OF_HORIZON = 0.9

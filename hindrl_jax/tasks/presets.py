@@ -95,7 +95,7 @@ def _default(algo: Algorithm, env: Environment) -> TrainConfig:
         agent = AgentConfig(net_arch=IMITATION_NET_ARCH)
         return TrainConfig(algo="bc", steps=1_500, eval_every=250, batch=BatchConfig(n_step=1), goal=goal, agent=agent)
     practice_rounds = _PRACTICE_ROUNDS if can_step(env) and not isinstance(env, RelabelsObservations) else 0
-    return TrainConfig(imitation_steps=_IMITATION_STEPS, practice_rounds=practice_rounds, goal=goal, batch=_batch(env))
+    return TrainConfig(imitation_steps=_IMITATION_STEPS, practice_rounds=practice_rounds, network_resets=True, goal=goal, batch=_batch(env))
 
 
 def _batch(env: Environment) -> BatchConfig:

@@ -149,6 +149,8 @@ def _train(result: Result, programs: Programs, report: Report) -> None:
         evaluations_done = len(result.rows) // len(result.seeds)
         if result.steps_done >= min(programs.steps_at_random + (evaluations_done + 1) * config.eval_every, config.num_steps):
             evaluate(result, programs, started)
+            if result.are_stuck.any():
+                result.state = programs.reset_networks(result.state, result.are_stuck)
         result.train_seconds = time.perf_counter() - started
         ends = asks_to_end(report(result)) or result.kept.all_confirmed
     if not result.rows:  # ended by `report` before the first evaluation

@@ -60,10 +60,13 @@ class ProgressBar:
             self._practice_said = int(result.practice_steps.sum())
             self.say(practice_line(result.practised_success, result.practice_steps))
         if len(result.rows) > self._rows_seen:
+            stuck = [seed for seed, is_stuck in zip(result.seeds, result.are_stuck, strict=True) if is_stuck]
             self._rows_seen, self._last_is_said = len(result.rows), tenths > self._lines_said
             if self._last_is_said:
                 self._lines_said = tenths
                 self.say(evaluation_line(result.rows[-len(result.seeds) :]))
+            if stuck:
+                self.say(reset_line(stuck, result.env_steps))
         if result.final_success is None:
             if self._began is None and result.steps_done and result.train_seconds:
                 self._began = (result.steps_done, result.train_seconds)
@@ -163,6 +166,12 @@ def practice_line(success: np.ndarray, steps: np.ndarray) -> str:
     """One line on the same policies after practice of so many environment steps, both (S,)."""
     spread = f" (worst {success.min():.0%})" if len(success) > 1 else ""
     return f"after {steps.mean():,.0f} steps of practice {success.mean():.0%}{spread}"
+
+
+def reset_line(seeds: Sequence[int], env_steps: int) -> str:
+    """One line on runs whose agents are stuck."""
+    which = f"seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}"
+    return f"{env_steps:9,d} steps   {which} got no better for long: fresh networks learn from what was played"
 
 
 def evaluation_line(rows: Sequence[Row]) -> str:

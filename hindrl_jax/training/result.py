@@ -14,6 +14,7 @@ from hindrl_jax.base.types import Array
 from hindrl_jax.config import TrainConfig
 from hindrl_jax.core.guidance import Guidance
 from hindrl_jax.core.train import TrainState
+from hindrl_jax.training.resetting import resets
 from hindrl_jax.training.selection import Kept, Moment, Returned
 
 SAMPLED_SUCCESS = "evaluation/sampled_success"
@@ -43,6 +44,11 @@ class Row:
     def sampled_success(self) -> float | None:
         """The share that the same policy solves with actions that it samples; None where only the mean action was played."""
         return self.metrics.get(SAMPLED_SUCCESS)
+
+    @property
+    def best_success(self) -> float:
+        """The larger of the two."""
+        return max(self.success, self.metrics.get(SAMPLED_SUCCESS, 0.0))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,6 +82,8 @@ class SeedSummary:
     was none. The clone of an earlier round may be better, and the one that is returned."""
     practice_steps: int
     """Environment steps of all its practice; `env_steps` does not count them."""
+    network_resets: int
+    """Times at which its agent was stuck and began anew (`TrainConfig.network_resets`)."""
     evaluation_steps: int
     """Environment steps that evaluations and the choice of the returned policy took; `env_steps` does not count them."""
 
@@ -170,6 +178,28 @@ class Result:
         """How far the experiment is."""
         return Moment(self.env_steps, self.updates, self.train_seconds)
 
+    @property
+    def resets(self) -> list[list[int]]:
+        """The environment steps at which each run was stuck and began anew, S lists; see `TrainConfig.network_resets`."""
+        config, num_runs = self.config, len(self.seeds)
+        if not config.network_resets:
+            return [[] for _ in self.seeds]
+        return [
+            resets(
+                [row.env_steps for row in rows],
+                [row.best_success for row in rows],
+                of=config.num_steps,
+                num_episodes=config.eval_episodes,
+                enough=config.stop_at or SOLVED,
+            )
+            for rows in (self.rows[index::num_runs] for index in range(num_runs))
+        ]
+
+    @property
+    def are_stuck(self) -> np.ndarray:
+        """(S,) bool, which agents are, according to the newest evaluation, and so begin anew if it was made just now."""
+        return np.asarray([self.env_steps in steps for steps in self.resets])
+
     def latest_success(self) -> float | None:
         """Success of the newest evaluation, averaged over runs; None before the first."""
         newest = self.rows[-len(self.seeds) :]
@@ -222,6 +252,7 @@ class Result:
             cloned_success=None if self.cloned_success is None else float(self.cloned_success[index]),
             practised_success=None if self.practised_success is None or not self.practice_steps[index] else float(self.practised_success[index]),
             practice_steps=int(self.practice_steps[index]),
+            network_resets=len(self.resets[index]),
             evaluation_steps=int(self.evaluation_steps[index]),
         )
 

@@ -27,7 +27,7 @@ from hindrl_jax.tasks.presets import preset
 from hindrl_jax.training.result import Row
 
 SEED_FIELDS = {"seed", "final_success", "env_steps_to_95", "updates_to_95", "seconds_to_95", "episode_length", "evaluation_steps", "cloned_success"}
-SEED_FIELDS |= {"practised_success", "practice_steps"}
+SEED_FIELDS |= {"practised_success", "practice_steps", "network_resets"}
 SEED_FIELDS |= {f"returned_{what}" for what in ("success", "length", "noise", "env_steps", "updates", "seconds")}
 TOTALS = {"updates_per_second", "env_steps_per_second", "compile_seconds", "train_seconds", "peak_memory_bytes"}
 

@@ -51,6 +51,7 @@ OF_THE_HOST = {
     "eval_every": "how many iterations are run between evaluations",
     "eval_episodes": "how many episodes an evaluation plays; it does not lead back to the policy",
     "stop_at": "ends the run",
+    "network_resets": "replaces the agent between two calls of the program",
     "action_chunks": "as action_hold",
     "action_hold": "the programs are given another environment and other demonstrations, and count steps by it",
 }

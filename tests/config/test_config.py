@@ -131,6 +131,7 @@ BAD = [
     (TrainConfig, "practice_rounds", [-1, True, 2**31]),
     (TrainConfig, "imitation_proposal", [1, True]),  # True without a policy that could propose
     (TrainConfig, "action_chunks", [1, None]),
+    (TrainConfig, "network_resets", [1, None]),
     (TrainConfig, "buffer_size", [0, 1e6]),
     (TrainConfig, "eval_every", [0]),
     (TrainConfig, "eval_episodes", [0]),
@@ -193,6 +194,7 @@ def test_the_algorithm_must_fit_its_settings(fitting, contradiction, name):
         dict(imitation_steps=1),
         dict(practice_rounds=1),
         dict(imitation_proposal=True),
+        dict(network_resets=True),
         dict(agent=AgentConfig(q_filter="hard")),
         dict(agent=AgentConfig(base="sac")),
     ],

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import inspect
+import itertools
 
 import chex
 import jax
@@ -195,6 +196,24 @@ def test_cloning_moves_the_actor_alone_and_its_average_follows(data):
     chex.assert_trees_all_close(cloned.agent.average_actor, cloned.agent.actor, atol=0.1)  # it has followed
     moved = jax.tree.map(lambda old, new: float(np.abs(old - new).max()), start.agent.average_actor, cloned.agent.average_actor)
     assert max(jax.tree.leaves(moved)) > 0.1
+
+
+def test_a_stuck_agent_is_replaced_by_a_fresh_one_and_all_else_stays(learnt, data):
+    env, config, without_keys = make_env(), make_config(imitation_steps=3), dict(key=None, rollout=None)
+    started = agents.init(jax.random.key(8), data.scale, config, action_dim=env.action_dim)
+    state = learnt[2].replace(agent=learnt[2].agent.replace(imitation=started.imitation))
+    reset = functools.partial(program(train.reset_networks), env=env, config=config)
+    chex.assert_trees_all_equal(reset(state, jnp.array(False)).replace(**without_keys), state.replace(**without_keys))
+    fresh = reset(state, jnp.array(True))
+    chex.assert_trees_all_equal(fresh.replace(agent=state.agent, updates=state.updates, **without_keys), state.replace(**without_keys))
+    assert (int(fresh.updates), int(state.updates) > 0) == (0, True)
+    chex.assert_trees_all_equal_shapes_and_dtypes(fresh.agent, started)
+    chex.assert_trees_all_equal((fresh.agent.imitation, fresh.agent.scale), (started.imitation, started.scale))
+    chex.assert_trees_all_equal((fresh.agent.critics, fresh.agent.actor), (fresh.agent.target_critics, fresh.agent.average_actor))
+    assert int(fresh.agent.actor_optimiser.count) == 0
+    later = reset(fresh.replace(key=jax.random.key(9)), jnp.array(True))
+    kernels = [np.asarray(one.agent.actor["params"]["Dense_0"]["kernel"]) for one in (state, fresh, later)]
+    assert min(np.abs(a - b).max() for a, b in itertools.combinations(kernels, 2)) > 0.1
 
 
 def test_warm_up_lasts_until_an_episode_can_be_complete():

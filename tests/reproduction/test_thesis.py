@@ -93,7 +93,7 @@ def test_laptop_changes_batches_and_steps_of_the_thesis_alone():
     assert spec.config == dataclasses.replace(whole, steps=200_000, eval_every=10_000, batch=batch)
     assert spec.seeds == (5_000, 5_001, 5_002, 5_003)
     assert spec_of(Setting("fixed-1", "hindrl"), recipe="default", scale="laptop").config == dataclasses.replace(
-        preset("hindrl"), imitation_steps=0, practice_rounds=0
+        preset("hindrl"), imitation_steps=0, practice_rounds=0, network_resets=False
     )
     assert len(spec_of(Setting("fixed-1", "hindrl"), recipe="default", scale="laptop").seeds) == 32
     assert len(spec_of(Setting("reach-1", "hindrl"), recipe="default", scale="laptop").seeds) == 8

@@ -166,7 +166,7 @@ def test_there_is_one_recipe_and_what_differs_follows_from_what_an_environment_d
     differences = {name: {field: value for field, value in recipe.items() if value != grid[field]} for name, recipe in recipes.items()}
     both = {"hindrl_sampling_strategy": "joint_union", "practice_rounds": 0}
     own_goals = {"behavioural_goals": "environment", "epsilon": 0.02886, "relabelled_per_original": 4.0}  # 0.05 over the root of 3
-    assert preset("hindrl", env="GridPickAndPlace") == TrainConfig(imitation_steps=750, practice_rounds=10)
+    assert preset("hindrl", env="GridPickAndPlace") == TrainConfig(imitation_steps=750, practice_rounds=10, network_resets=True)
     assert differences == {
         "GridPickAndPlace": {},
         "FixedGridPickAndPlace": {},

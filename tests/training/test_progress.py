@@ -39,6 +39,7 @@ def result(done, *, every=100, seeds=(0, 1), algo="hindrl", finished=False, clon
         cloned_success=cloned,
         practised_success=None,
         practice_steps=np.zeros(len(seeds), int),
+        are_stuck=np.zeros(len(seeds), bool),
         latest_success=lambda: float(np.mean([row.success for row in rows[-len(seeds) :]])) if rows else None,
     )
 
