@@ -242,7 +242,8 @@ def test_the_writer_of_a_run_tells_its_reporters(tmp_path):
     writer.report(ROWS)
     (reporter,) = writer.reporters
     summary = dict(env_steps_to_95=None, updates_to_95=None, seconds_to_95=None, episode_length=1.0)
-    summary |= {field.name: 0 for field in dataclasses.fields(SeedSummary) if field.name.startswith(("returned", "evaluation", "cloned", "practi", "network"))}
+    counted = ("returned", "evaluation", "cloned", "practi", "network")
+    summary |= {field.name: 0 for field in dataclasses.fields(SeedSummary) if field.name.startswith(counted)}
     reporter.finish([SeedSummary(seed=seed, final_success=0.5, **summary) for seed in (3, 4)])
     assert told == [("start", (3, 4)), (100, [0.25, 0.75]), (200, [0.5, 1.0]), (200, [0.5, 0.5]), "close"]
     assert (tmp_path / "metrics.csv").read_text().count("\n") == 5
