@@ -59,8 +59,8 @@ class TrainConfig:
     """That policy, as it is after its practice, proposes an action beside the actor's: whichever the target critics value more is taken, in episodes,
     evaluations and targets (IBRL, Hu et al., 2024)."""
     network_resets: bool = False
-    """An agent that is stuck, since none of its evaluations was better for a fifth of the run, and for as long as it had taken to come there, begins
-    anew, with all that is in the replay (Nikishin et al., the primacy bias in deep reinforcement learning, 2022)."""
+    """Where an agent solves part of the task and got no better for a fifth of the run, and for as long as it had taken to that, fresh networks learn
+    in its place, from the same replay (Nikishin et al., the primacy bias in deep reinforcement learning, 2022)."""
     buffer_size: int = 500_000
     """Transitions that the replay holds."""
     stop_at: float | None = None

@@ -15,7 +15,7 @@ from hindrl_jax.training.result import Result
 def save_curve(result: Result, path: Path) -> None:
     """Draws success and episode length over training, one thin line per seed, their mean and its 95% bootstrap interval, as a PNG.
 
-    Of mean actions; the success of sampled ones is a dotted line, the mean over seeds.
+    Of mean actions; the success of sampled ones is a dotted line, the mean over seeds. The returned policies are marked, and where networks were reset.
     """
     x, success, length = _curves(result)
     with figure(path, rows=2, figsize=(7, 5.5), sharex=True, height_ratios=(3, 2)) as (_, axes):
@@ -100,8 +100,8 @@ def _mark_returned(axis: Any, result: Result) -> None:
 
 def _mark_resets(axis: Any, result: Result) -> None:
     """Where networks were reset, on the curves of their runs."""
-    at = {(seed, steps) for seed, of_run in zip(result.seeds, result.resets, strict=True) for steps in of_run}
-    points = [(row.env_steps, 100 * row.success) for row in result.rows if (row.seed, row.env_steps) in at]
+    of_runs = [(result.rows[index :: len(result.seeds)], steps) for index, steps in enumerate(result.resets)]
+    points = [(row.env_steps, 100 * row.success) for rows, steps in of_runs for row in rows if row.env_steps in steps]
     if points:
         axis.scatter(*zip(*points, strict=True), s=18, color=MEAN, marker="v", zorder=4, label="networks reset")
 

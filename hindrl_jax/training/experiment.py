@@ -138,6 +138,8 @@ def _train(result: Result, programs: Programs, report: Report) -> None:
         result.state = jax.block_until_ready(programs.collect(result.state, result.guidance))
         result.env_steps = programs.steps_at_random
     while result.steps_done < config.num_steps and not ends:
+        if result.are_stuck.any():  # at the latest evaluation, after which nothing was learnt yet
+            started += _reset_networks(result, programs)
         result.state, metrics = programs.learn(result.state, result.guidance)
         result.chunks.append(gather(metrics))
         if config.learns_from_rollouts:
@@ -149,10 +151,18 @@ def _train(result: Result, programs: Programs, report: Report) -> None:
         evaluations_done = len(result.rows) // len(result.seeds)
         if result.steps_done >= min(programs.steps_at_random + (evaluations_done + 1) * config.eval_every, config.num_steps):
             evaluate(result, programs, started)
-            if result.are_stuck.any():
-                result.state = programs.reset_networks(result.state, result.are_stuck)
         result.train_seconds = time.perf_counter() - started
         ends = asks_to_end(report(result)) or result.kept.all_confirmed
     if not result.rows:  # ended by `report` before the first evaluation
         evaluate(result, programs, started)
     choose_returned(result, programs)
+
+
+def _reset_networks(result: Result, programs: Programs) -> float:
+    """Gives fresh networks to the runs whose agents are stuck; returns the seconds in which the program for it was compiled, 0 but the first time."""
+    began = time.perf_counter()
+    programs.compile_reset(result.state)
+    waited = time.perf_counter() - began
+    result.compile_seconds += waited
+    result.state = programs.reset_networks(result.state, result.are_stuck)
+    return waited

@@ -73,7 +73,7 @@ class Programs(abc.ABC):
         values = {name: np.asarray([sweepable_value(config, name) for config in configs], np.float32) for name in swept_fields(configs)}
         self._compile(shapes_on((jax.ShapeDtypeStruct((num_seeds,), np.uint32), demonstrations), self.mesh), shapes_on(values, self.mesh))
         self.values: Values = spread(values, self.mesh)
-        self._resetting: Any = None
+        self._reset: Any = None
 
     @abc.abstractmethod
     def _compile(self, given: tuple[Any, Any], values: Any) -> None:
@@ -104,12 +104,15 @@ class Programs(abc.ABC):
     def learn(self, state: TrainState, guidance: Guidance) -> tuple[TrainState, Metrics]:
         """`chunk` iterations of learning, from rollouts or, for behaviour cloning, from demonstrations alone; the state is donated."""
 
+    def compile_reset(self, state: TrainState) -> None:
+        """Compiles what `reset_networks` needs, if that is not done: not at the beginning with all else, as most runs never need it."""
+        if self._reset is None:
+            is_stuck = spread(np.zeros(len(state.env_steps), bool), self.mesh)
+            self._reset = self._trace(training.reset_networks, state, is_stuck, self.values, donate=True).lower().compile(compiler_options(self.env))
+
     def reset_networks(self, state: TrainState, is_stuck: np.ndarray) -> TrainState:
-        """A fresh agent in the place of each that `is_stuck`, (S,) bool; the state is donated. Compiled when it is first wanted, which is seldom."""
-        given = (state, spread(is_stuck, self.mesh), self.values)
-        if self._resetting is None:
-            self._resetting = self._trace(training.reset_networks, *given, donate=True).lower().compile(compiler_options(self.env))
-        return self._resetting(*given)
+        """A fresh agent in the place of each that `is_stuck`, (S,) bool, after `compile_reset`; the state is donated."""
+        return self._reset(state, spread(is_stuck, self.mesh), self.values)
 
     @abc.abstractmethod
     def evaluate(self, key: Array, policy: Policy, guidance: Guidance, num_episodes: int) -> tuple[Array, Evaluation]:

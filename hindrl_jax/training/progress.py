@@ -60,13 +60,12 @@ class ProgressBar:
             self._practice_said = int(result.practice_steps.sum())
             self.say(practice_line(result.practised_success, result.practice_steps))
         if len(result.rows) > self._rows_seen:
-            stuck = [seed for seed, is_stuck in zip(result.seeds, result.are_stuck, strict=True) if is_stuck]
             self._rows_seen, self._last_is_said = len(result.rows), tenths > self._lines_said
             if self._last_is_said:
                 self._lines_said = tenths
                 self.say(evaluation_line(result.rows[-len(result.seeds) :]))
-            if stuck:
-                self.say(reset_line(stuck, result.env_steps))
+            if result.are_stuck.any() and result.steps_done < result.config.num_steps:
+                self.say(reset_line(result.seeds, result.are_stuck, result.env_steps))
         if result.final_success is None:
             if self._began is None and result.steps_done and result.train_seconds:
                 self._began = (result.steps_done, result.train_seconds)
@@ -168,9 +167,10 @@ def practice_line(success: np.ndarray, steps: np.ndarray) -> str:
     return f"after {steps.mean():,.0f} steps of practice {success.mean():.0%}{spread}"
 
 
-def reset_line(seeds: Sequence[int], env_steps: int) -> str:
-    """One line on runs whose agents are stuck."""
-    which = f"seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}"
+def reset_line(seeds: Sequence[int], are_stuck: np.ndarray, env_steps: int) -> str:
+    """One line on runs whose agents are stuck, (S,) bool; in a sweep, whose runs share seeds, on how many they are."""
+    stuck = [str(seed) for seed, is_stuck in zip(seeds, are_stuck, strict=True) if is_stuck]
+    which = f"seed{'s' if len(stuck) > 1 else ''} {', '.join(stuck)}" if len(set(seeds)) == len(seeds) else f"{len(stuck)} of {len(seeds)} runs"
     return f"{env_steps:9,d} steps   {which} got no better for long: fresh networks learn from what was played"
 
 

@@ -1,4 +1,4 @@
-"""When a run is stuck and learns anew, see `core.train.reset_networks`: decided by nothing but its evaluations.
+"""When an agent is stuck, and a fresh one learns in its place, see `core.train.reset_networks`: decided by nothing but evaluations.
 
 What an agent happens to solve first decides what it can learn later, and some never learn the rest, whatever they see (the primacy bias; Nikishin et
 al., 2022). A fresh agent that begins with the same replay mostly does.
@@ -11,16 +11,19 @@ from collections.abc import Sequence
 import numpy as np
 
 SHARE = 0.2
-"""Of a run's steps, without a better evaluation, after which it is stuck, if its agent needed no more for the best one."""
+"""An agent is given this share of the run's environment steps, at least, to get better than it was."""
 DEVIATIONS = 2.0
-"""An evaluation is better than another one if it is more than so many of that one's standard errors above it."""
+"""It is better if an evaluation is more than so many standard errors above the last one that counted as better."""
+SOME = 0.2
+"""An agent that solves less than this share of its episodes is not stuck but at its beginning, and its replay has little to learn from."""
 
 
 def resets(env_steps: Sequence[int], success: Sequence[float], *, of: int, num_episodes: int, enough: float) -> list[int]:
-    """The environment steps at which a run began anew.
+    """The environment steps at which a run was stuck, and went on with a fresh agent.
 
-    An agent is stuck when no evaluation was better than its best for a fifth of the run, and for as long as it had taken to that one. It begins anew
-    if as many steps are left, and if it solves something, and not `enough`.
+    Each agent has a mark, the last of its evaluations that was better than the mark before. It is stuck when it has been without a better one for
+    `SHARE` of the run, and for as long as it took it to reach its mark, if the mark is at least `SOME` and below `enough`. Then there is a fresh
+    agent, if as much time is left for it.
 
     Args:
       env_steps: (N,) of the run's evaluations.
@@ -35,12 +38,12 @@ def resets(env_steps: Sequence[int], success: Sequence[float], *, of: int, num_e
     """
     found: list[int] = []
     began = reached = 0
-    best = 0.0
+    mark = 0.0
     for steps, solved in zip(env_steps, success, strict=True):
-        if solved >= enough or solved > best + DEVIATIONS * np.sqrt(best * (1.0 - best) / num_episodes):
-            best, reached = solved, steps
-        took = reached - began
-        if 0.0 < best < enough and steps - reached >= max(took, SHARE * of) and of - steps >= took:
+        if solved >= enough or solved > mark + DEVIATIONS * np.sqrt(mark * (1.0 - mark) / num_episodes):
+            mark, reached = solved, steps
+        patience = max(reached - began, SHARE * of)
+        if SOME <= mark < enough and steps - reached >= patience and of - steps >= patience:
             found.append(steps)
-            began, reached, best = steps, steps, 0.0
+            began, reached, mark = steps, steps, 0.0
     return found

@@ -83,7 +83,7 @@ class SeedSummary:
     practice_steps: int
     """Environment steps of all its practice; `env_steps` does not count them."""
     network_resets: int
-    """Times at which its agent was stuck and began anew (`TrainConfig.network_resets`)."""
+    """How often its agent was stuck, and a fresh one went on (`TrainConfig.network_resets`)."""
     evaluation_steps: int
     """Environment steps that evaluations and the choice of the returned policy took; `env_steps` does not count them."""
 
@@ -180,24 +180,26 @@ class Result:
 
     @property
     def resets(self) -> list[list[int]]:
-        """The environment steps at which each run was stuck and began anew, S lists; see `TrainConfig.network_resets`."""
+        """The environment steps at which each run was stuck and went on with a fresh agent, S lists; see `TrainConfig.network_resets`."""
         config, num_runs = self.config, len(self.seeds)
         if not config.network_resets:
             return [[] for _ in self.seeds]
-        return [
-            resets(
-                [row.env_steps for row in rows],
-                [row.best_success for row in rows],
-                of=config.num_steps,
-                num_episodes=config.eval_episodes,
-                enough=config.stop_at or SOLVED,
-            )
-            for rows in (self.rows[index::num_runs] for index in range(num_runs))
-        ]
+        of_runs = []
+        for index in range(num_runs):
+            rows = self.rows[index::num_runs]
+            steps, success = [row.env_steps for row in rows], [row.best_success for row in rows]
+            found = resets(steps, success, of=config.num_steps, num_episodes=config.eval_episodes, enough=config.stop_at or SOLVED)
+            of_runs.append([] if self._ends_with_a_clone(index) else found)
+        return of_runs
+
+    def _ends_with_a_clone(self, index: int) -> bool:
+        """Whether a run is over because its clone was confirmed; what it learns beside those that go on matters to nobody."""
+        slot = self.kept.confirmed[index]
+        return bool(slot >= 0 and self.kept.updates[index, slot] == 0)
 
     @property
     def are_stuck(self) -> np.ndarray:
-        """(S,) bool, which agents are, according to the newest evaluation, and so begin anew if it was made just now."""
+        """(S,) bool, which agents are, according to an evaluation at the present step; none where there was none."""
         return np.asarray([self.env_steps in steps for steps in self.resets])
 
     def latest_success(self) -> float | None:
@@ -207,7 +209,7 @@ class Result:
 
     def summaries(self) -> list[SeedSummary]:
         """One summary per run of a finished experiment."""
-        return [self._summary(index, seed) for index, seed in enumerate(self.seeds)]
+        return [self._summary(index, seed, len(resets)) for index, (seed, resets) in enumerate(zip(self.seeds, self.resets, strict=True))]
 
     def rows_of(self, runs: slice) -> list[Row]:
         """The rows of some of the runs, in order of time."""
@@ -233,7 +235,7 @@ class Result:
             final_length=self.final_length[runs],
         )
 
-    def _summary(self, index: int, seed: int) -> SeedSummary:
+    def _summary(self, index: int, seed: int, network_resets: int) -> SeedSummary:
         rows = self.rows[index :: len(self.seeds)]
         first = next((row for row in rows if row.success >= SOLVED), None)
         return SeedSummary(
@@ -252,7 +254,7 @@ class Result:
             cloned_success=None if self.cloned_success is None else float(self.cloned_success[index]),
             practised_success=None if self.practised_success is None or not self.practice_steps[index] else float(self.practised_success[index]),
             practice_steps=int(self.practice_steps[index]),
-            network_resets=len(self.resets[index]),
+            network_resets=network_resets,
             evaluation_steps=int(self.evaluation_steps[index]),
         )
 

@@ -6,10 +6,14 @@ import jax
 import numpy as np
 import pytest
 import tiny
+from host_env import HostCorridor
+from matplotlib.axes import Axes
 from toy_env import Corridor, corridor_demonstrations
 
 import hindrl_jax as hindrl
+from hindrl_jax.plotting import curves
 from hindrl_jax.runs.checkpoints import Checkpoints
+from hindrl_jax.training.progress import reset_line
 from hindrl_jax.training.resetting import resets
 
 
@@ -17,11 +21,12 @@ from hindrl_jax.training.resetting import resets
     ("success", "at"),
     [
         ([0.0] * 10, []),  # it has nothing to learn anew from
-        ([0.5] * 10, [30, 60, 90]),
-        ([0.5, 0.59, 0.41, 0.55, 0.5, 0.59, 0.5, 0.5, 0.5, 0.5], [30, 60, 90]),  # noise: the standard error is 0.05
+        ([0.15] * 10, []),
+        ([0.5] * 10, [30, 60]),  # at 90 no agent would have the time that this one had
+        ([0.5, 0.59, 0.41, 0.55, 0.5, 0.59, 0.5, 0.5, 0.5, 0.5], [30, 60]),  # noise: the standard error is 0.05
         ([0.5, 0.61, 0.6, 0.6, 0.6, 0.6, 0.6, 0.6, 0.6, 0.6], [40, 70]),  # better at 20
-        ([0.1, 0.2, 0.3, 0.4, 0.4, 0.4, 0.4, 0.4, 0.4, 0.4], []),  # it took 30 steps, was given 30 more, and is stuck at 60: too late
-        ([0.1, 0.1, 0.3, 0.5, 0.6, 0.75, 0.7, 0.7, 0.7, 0.7], []),  # 60
+        ([0.1, 0.2, 0.3, 0.4, 0.4, 0.4, 0.4, 0.4, 0.4, 0.4], []),  # better until 40, and at 80 too little is left
+        ([0.1, 0.1, 0.3, 0.5, 0.62, 0.75, 0.7, 0.7, 0.7, 0.7], []),  # better until 60
         ([0.5, 0.5, 0.96, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3], []),  # it was enough once
         ([0.5, 0.5, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], [30]),  # the second agent solves nothing
         ([0.5, 0.5, 0.5, 0.2, 0.4, 0.6, 0.8, 0.96, 0.9, 0.9], [30]),
@@ -31,7 +36,7 @@ from hindrl_jax.training.resetting import resets
 )
 def test_a_run_begins_anew_where_nothing_was_better_for_long(success, at):
     steps = list(range(10, 10 * len(success) + 1, 10))
-    assert resets(steps, success, of=100, num_episodes=100, enough=0.95) == [step for step in at if step <= steps[-1]]
+    assert resets(steps, success, of=100, num_episodes=100, enough=0.95) == at
 
 
 def test_it_does_not_where_too_few_steps_are_left():
@@ -40,8 +45,8 @@ def test_it_does_not_where_too_few_steps_are_left():
     assert resets(steps, success, of=119, num_episodes=100, enough=0.95) == []
 
 
-ENV = Corridor(width=4.5)
-"""At a rate at which nothing is learnt, seed 3 solves a fifth of its episodes with sampled actions, and seed 4 all of them."""
+ENV = Corridor(width=4.0)
+"""At a rate at which nothing is learnt, seed 3 solves two fifths of its episodes with sampled actions, and seed 4 all of them."""
 CONFIG = dataclasses.replace(
     tiny.CONFIG,
     steps=240,
@@ -55,8 +60,8 @@ CONFIG = dataclasses.replace(
 )
 
 
-def fit(config=CONFIG, **choices):
-    return hindrl.fit(ENV, corridor_demonstrations((1.25, 1.7), env=ENV), config, seeds=[3, 4], **choices)
+def fit(config=CONFIG, *, env=ENV, seeds=(3, 4), **choices):
+    return hindrl.fit(env, corridor_demonstrations((1.25, 1.7), env=ENV), config, seeds=seeds, **choices)
 
 
 @pytest.fixture(scope="module")
@@ -103,3 +108,35 @@ def test_a_run_that_was_killed_after_its_networks_were_reset_goes_on_as_it_would
     assert resumed.resets == result.resets
     jax.tree.map(np.testing.assert_array_equal, resumed.state.agent, result.state.agent)
     np.testing.assert_array_equal(resumed.returned.success, result.returned.success)
+
+
+def test_a_run_that_is_ended_when_its_agent_is_stuck_keeps_it():
+    """The last policy is the one that was evaluated, and not one that has learnt nothing."""
+    ended = fit(report=lambda so_far: bool(so_far.are_stuck.any()))
+    assert ended.resets[0][-1] == ended.env_steps < CONFIG.steps
+    assert np.asarray(ended.state.updates).tolist() == [ended.updates] * 2
+
+
+def test_fresh_agents_where_environments_are_stepped_outside_jax_and_where_settings_differ():
+    """Each begins with the entropy coefficient of its own config."""
+    others = [dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, initial_alpha=alpha)) for alpha in (0.5, 0.1)]
+    for env in (ENV, HostCorridor(width=ENV.width)):
+        result = fit(others, env=env, seeds=(3, 3))
+        assert all(result.resets), env.name
+        assert (np.asarray(result.state.updates) < result.updates).all()
+        np.testing.assert_allclose(np.exp(np.asarray(result.state.agent.log_alpha)), [0.5, 0.1], rtol=1e-3)
+
+
+def test_what_is_said_and_drawn_of_it(result, tmp_path, monkeypatch):
+    assert (
+        reset_line([3, 4], np.array([True, False]), 40)
+        == "       40 steps   seed 3 got no better for long: fresh networks learn from what was played"
+    )
+    assert "seeds 3, 4 got" in reset_line([3, 4], np.array([True, True]), 40)
+    assert "1 of 2 runs got" in reset_line([3, 3], np.array([False, True]), 40)
+    drawn, scatter = {}, Axes.scatter
+    monkeypatch.setattr(Axes, "scatter", lambda axis, x, y, **given: drawn.update({given["label"]: (x, y)}) or scatter(axis, x, y, **given))
+    curves.save_curve(result, tmp_path / "curve.png")
+    steps, success = drawn["networks reset"]
+    assert list(steps) == result.resets[0]
+    assert list(success) == [100 * row.success for row in result.rows if row.seed == 3 and row.env_steps in result.resets[0]]
