@@ -15,7 +15,8 @@ from hindrl_jax.training.result import Result
 def save_curve(result: Result, path: Path) -> None:
     """Draws success and episode length over training, one thin line per seed, their mean and its 95% bootstrap interval, as a PNG.
 
-    Of mean actions; the success of sampled ones is a dotted line, the mean over seeds. The returned policies are marked, and where networks were reset.
+    Of mean actions; the success of sampled ones is a dotted line, the mean over seeds. The returned policies are marked, and where networks were
+    reset.
     """
     x, success, length = _curves(result)
     with figure(path, rows=2, figsize=(7, 5.5), sharex=True, height_ratios=(3, 2)) as (_, axes):
