@@ -14,7 +14,7 @@ from hindrl_jax.training.host import HostPrograms
 from hindrl_jax.training.host_playing import HostPolicies
 from hindrl_jax.training.programs import JaxPrograms
 
-MOST = 16  # of each kind; the one that was not used for the longest time is forgotten
+MOST = 8  # of each kind; the one that was not used for the longest time is forgotten
 _kept = collections.defaultdict(collections.OrderedDict)
 
 

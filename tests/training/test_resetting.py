@@ -120,11 +120,10 @@ def test_a_run_that_is_ended_when_its_agent_is_stuck_keeps_it():
 def test_fresh_agents_where_environments_are_stepped_outside_jax_and_where_settings_differ():
     """Each begins with the entropy coefficient of its own config."""
     others = [dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, initial_alpha=alpha)) for alpha in (0.5, 0.1)]
-    for env in (ENV, HostCorridor(width=ENV.width)):
-        result = fit(others, env=env, seeds=(3, 3))
-        assert all(result.resets), env.name
-        assert (np.asarray(result.state.updates) < result.updates).all()
-        np.testing.assert_allclose(np.exp(np.asarray(result.state.agent.log_alpha)), [0.5, 0.1], rtol=1e-3)
+    result = fit(others, env=HostCorridor(width=ENV.width), seeds=(3, 3))
+    assert all(result.resets)
+    assert (np.asarray(result.state.updates) < result.updates).all()
+    np.testing.assert_allclose(np.exp(np.asarray(result.state.agent.log_alpha)), [0.5, 0.1], rtol=1e-3)
 
 
 def test_what_is_said_and_drawn_of_it(result, tmp_path, monkeypatch):
