@@ -184,12 +184,12 @@ class Result:
         config, num_runs = self.config, len(self.seeds)
         if not config.network_resets:
             return [[] for _ in self.seeds]
-        of_runs = []
+        of_runs, last = [], self.env_steps - 1 if self.final_success is not None else self.env_steps  # where it ended, nothing was begun
         for index in range(num_runs):
             rows = self.rows[index::num_runs]
             steps, success = [row.env_steps for row in rows], [row.best_success for row in rows]
             found = resets(steps, success, of=config.num_steps, num_episodes=config.eval_episodes, enough=config.stop_at or SOLVED)
-            of_runs.append([] if self._ends_with_a_clone(index) else found)
+            of_runs.append([] if self._ends_with_a_clone(index) else [at for at in found if at <= last])
         return of_runs
 
     def _ends_with_a_clone(self, index: int) -> bool:
