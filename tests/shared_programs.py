@@ -39,18 +39,18 @@ def _once(method, key_of):
             key = _hashable(key_of(self, *given))
             hash(key)
         except TypeError:
-            return method(self, *given)
-        kept, of_method = _kept[method], dict(vars(self))
+            method(self, *given)
+            return
+        kept, before = _kept[method], set(vars(self))
         if key not in kept:
             method(self, *given)
-            kept[key] = {name: value for name, value in vars(self).items() if name not in of_method}
+            kept[key] = {name: value for name, value in vars(self).items() if name not in before}
             if len(kept) > MOST:
                 kept.popitem(last=False)
         kept.move_to_end(key)
         vars(self).update(kept[key])
         if "shapes" in kept[key]:
             self._check_fits_into_memory(self.shapes["state"])
-        return None
 
     return wrapped
 

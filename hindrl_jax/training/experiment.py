@@ -138,8 +138,9 @@ def _train(result: Result, programs: Programs, report: Report) -> None:
         result.state = jax.block_until_ready(programs.collect(result.state, result.guidance))
         result.env_steps = programs.steps_at_random
     while result.steps_done < config.num_steps and not ends:
-        if result.are_stuck.any():  # at the latest evaluation, after which nothing was learnt yet
-            started += _reset_networks(result, programs)
+        are_stuck = result.are_stuck  # at the latest evaluation, after which nothing was learnt yet
+        if are_stuck.any():
+            started += _reset_networks(result, programs, are_stuck)
         result.state, metrics = programs.learn(result.state, result.guidance)
         result.chunks.append(gather(metrics))
         if config.learns_from_rollouts:
@@ -158,11 +159,11 @@ def _train(result: Result, programs: Programs, report: Report) -> None:
     choose_returned(result, programs)
 
 
-def _reset_networks(result: Result, programs: Programs) -> float:
-    """Gives fresh networks to the runs whose agents are stuck; returns the seconds in which the program for it was compiled, 0 but the first time."""
+def _reset_networks(result: Result, programs: Programs, are_stuck: np.ndarray) -> float:
+    """Gives fresh networks to the runs whose agents are stuck (S,); returns the seconds in which the program was compiled, 0 but the first time."""
     began = time.perf_counter()
     programs.compile_reset(result.state)
     waited = time.perf_counter() - began
     result.compile_seconds += waited
-    result.state = programs.reset_networks(result.state, result.are_stuck)
+    result.state = programs.reset_networks(result.state, are_stuck)
     return waited

@@ -108,7 +108,8 @@ class Programs(abc.ABC):
         """Compiles what `reset_networks` needs, if that is not done: not at the beginning with all else, as most runs never need it."""
         if self._reset is None:
             is_stuck = spread(np.zeros(len(state.env_steps), bool), self.mesh)
-            self._reset = self._trace(training.reset_networks, state, is_stuck, self.values, donate=True).lower().compile(compiler_options(self.env))
+            with self._compiler() as compile_:
+                self._reset = compile_(self._trace(training.reset_networks, state, is_stuck, self.values, donate=True)).result()
 
     def reset_networks(self, state: TrainState, is_stuck: np.ndarray) -> TrainState:
         """A fresh agent in the place of each that `is_stuck`, (S,) bool, after `compile_reset`; the state is donated."""

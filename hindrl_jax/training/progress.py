@@ -64,8 +64,9 @@ class ProgressBar:
             if self._last_is_said:
                 self._lines_said = tenths
                 self.say(evaluation_line(result.rows[-len(result.seeds) :]))
-            if result.are_stuck.any() and result.steps_done < result.config.num_steps:
-                self.say(reset_line(result.seeds, result.are_stuck, result.env_steps))
+            are_stuck = result.are_stuck
+            if are_stuck.any():
+                self.say(reset_line(result.seeds, are_stuck, result.env_steps))
         if result.final_success is None:
             if self._began is None and result.steps_done and result.train_seconds:
                 self._began = (result.steps_done, result.train_seconds)

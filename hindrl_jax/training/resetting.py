@@ -6,9 +6,8 @@ al., 2022). A fresh agent that begins with the same replay mostly does.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-
-import numpy as np
 
 SHARE = 0.2
 """An agent is given this share of the run's environment steps, at least, to get better than it was."""
@@ -40,7 +39,7 @@ def resets(env_steps: Sequence[int], success: Sequence[float], *, of: int, num_e
     began = reached = 0
     mark = 0.0
     for steps, solved in zip(env_steps, success, strict=True):
-        if solved >= enough or solved > mark + DEVIATIONS * np.sqrt(mark * (1.0 - mark) / num_episodes):
+        if solved >= enough or solved > mark + DEVIATIONS * math.sqrt(mark * (1.0 - mark) / num_episodes):
             mark, reached = solved, steps
         patience = max(reached - began, SHARE * of)
         if SOME <= mark < enough and steps - reached >= patience and of - steps >= patience:

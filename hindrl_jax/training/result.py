@@ -48,7 +48,7 @@ class Row:
     @property
     def best_success(self) -> float:
         """The larger of the two."""
-        return max(self.success, self.metrics.get(SAMPLED_SUCCESS, 0.0))
+        return max(self.success, self.sampled_success or 0.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -184,12 +184,12 @@ class Result:
         config, num_runs = self.config, len(self.seeds)
         if not config.network_resets:
             return [[] for _ in self.seeds]
-        of_runs, last = [], self.env_steps - 1 if self.final_success is not None else self.env_steps  # where it ended, nothing was begun
+        of_runs, goes_on = [], self.final_success is None
         for index in range(num_runs):
-            rows = self.rows[index::num_runs]
+            rows = [] if self._ends_with_a_clone(index) else self.rows[index::num_runs]
             steps, success = [row.env_steps for row in rows], [row.best_success for row in rows]
             found = resets(steps, success, of=config.num_steps, num_episodes=config.eval_episodes, enough=config.stop_at or SOLVED)
-            of_runs.append([] if self._ends_with_a_clone(index) else [at for at in found if at <= last])
+            of_runs.append([at for at in found if goes_on or at < self.env_steps])  # where an experiment has ended, nothing was begun
         return of_runs
 
     def _ends_with_a_clone(self, index: int) -> bool:
@@ -200,6 +200,8 @@ class Result:
     @property
     def are_stuck(self) -> np.ndarray:
         """(S,) bool, which agents are, according to an evaluation at the present step; none where there was none."""
+        if not self.rows or self.rows[-1].env_steps != self.env_steps:  # spares looking through all evaluations at each chunk
+            return np.zeros(len(self.seeds), bool)
         return np.asarray([self.env_steps in steps for steps in self.resets])
 
     def latest_success(self) -> float | None:
